@@ -1,0 +1,12 @@
+"""The commands, one module each; a module is imported only when its command runs."""
+
+from __future__ import annotations
+
+COMMANDS: dict[str, str] = {
+    "demo": "map the bundled sample with every labeller and show what comes out",
+    "map": "map a stereo sequence",
+    "export": "write a map in another form",
+    "report": "write the HTML report of a run anew",
+    "info": "show versions, devices and folders",
+}
+"""Name and one-line help of each command, in the order of `jaxmap --help`."""

@@ -1,0 +1,102 @@
+"""What the commands share: parsing of options, lines for the user, progress."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import tyro
+
+Arguments = TypeVar("Arguments")
+
+
+def parse(
+    kind: type[Arguments], command: str, words: Sequence[str], with_config: Callable[[str], Arguments] | None = None
+) -> Arguments:
+    """Parses the options of a command; exits with status 2 where they are wrong.
+
+    Args:
+        kind: the dataclass of the options.
+        command: its name.
+        words: the command line after it.
+        with_config: gives the defaults under the configuration that `--config` names.
+    """
+    defaults = {}
+    if with_config is not None and (name := _value_of("--config", words)) is not None:
+        defaults["default"] = with_config(name)
+    return tyro.cli(
+        kind, prog=f"jaxmap {command}", args=list(words), config=(tyro.conf.FlagCreatePairsOff,), **defaults
+    )
+
+
+def _value_of(option: str, words: Sequence[str]) -> str | None:
+    for index, word in enumerate(words):
+        if word == option and index + 1 < len(words):
+            return words[index + 1]
+        if word.startswith(f"{option}="):
+            return word.partition("=")[2]
+    return None
+
+
+class Console:
+    """Lines and progress on stderr, results on stdout."""
+
+    def __init__(self) -> None:
+        """A progress bar is drawn only on a terminal; elsewhere a line now and then tells."""
+        from rich.console import Console as RichConsole
+
+        self._rich = RichConsole(stderr=True, highlight=False, soft_wrap=True)
+
+    def tell(self, line: str) -> None:
+        """One line for the user."""
+        self._rich.print(line, markup=False)
+
+    def result(self, folder: Path, names: Sequence[str]) -> None:
+        """Says where the outputs are."""
+        print(f"wrote {folder}/: {', '.join(names)}")
+
+    def table(self, title: str, columns: Mapping[str, str], rows: Sequence[Mapping[str, object]]) -> None:
+        """Prints rows as a table on stdout; `columns` names the keys shown and their headings."""
+        from rich.console import Console as RichConsole
+        from rich.table import Table
+
+        table = Table(title=title, title_justify="left")
+        for key, heading in columns.items():
+            table.add_column(heading, justify="left" if isinstance(rows[0][key], str) else "right")
+        for row in rows:
+            table.add_row(*(_cell(row[key]) for key in columns))
+        # A file or pipe has no width: the table must not be squeezed into 80 columns there.
+        out = RichConsole(highlight=False)
+        RichConsole(highlight=False, width=None if out.is_terminal else 200).print(table)
+
+    @contextmanager
+    def progress(self, title: str, total: int) -> Iterator[Callable[[object], None]]:
+        """Shows progress over `total` frames; yields what is to be called after each."""
+        if not self._rich.is_terminal:
+            yield self._plain_progress(title, total)
+            return
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=self._rich, transient=True) as bar:
+            task = bar.add_task(title, total=total)
+            yield lambda fused: bar.update(task, completed=fused.prepared.index + 1)  # type: ignore[attr-defined]
+
+    def _plain_progress(self, title: str, total: int) -> Callable[[object], None]:
+        told_s = time.monotonic()
+
+        def advance(fused: object) -> None:
+            nonlocal told_s
+            if time.monotonic() - told_s > 10:
+                told_s = time.monotonic()
+                print(f"{title}: {fused.prepared.index + 1} of {total} frames", file=sys.stderr)  # type: ignore[attr-defined]
+
+        return advance
+
+
+def _cell(value: object) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,38 @@
+"""`jaxmap export`: a map in another form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from jaxmap.commands.console import Console, parse
+
+
+@dataclass(frozen=True)
+class ExportArguments:
+    """Write the map of a run as PLY (occupied voxels), GeoTIFF (view from above) or PNG."""
+
+    run: tyro.conf.Positional[Path]
+    """A run folder, as jaxmap map has written it."""
+    format: Literal["ply", "geotiff", "png", "all"] = "all"
+    """What to write."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    arguments = parse(ExportArguments, "export", words)
+
+    from jaxmap.map_store import load_map
+    from jaxmap.run_folder import RunFolder
+    from jaxmap.run_outputs import EXPORTS, write_exports
+
+    folder = RunFolder(arguments.run)
+    voxel_map, attributes = load_map(folder.map)
+    formats = tuple(EXPORTS) if arguments.format == "all" else (arguments.format,)
+    write_exports(folder, voxel_map, attributes, formats)
+    Console().result(arguments.run, [EXPORTS[name] for name in formats])
+    return 0

@@ -1,0 +1,82 @@
+"""`jaxmap map`: batch mapping of one stereo sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxmap.commands.console import Console, parse
+from jaxmap.config import MapConfig, check_config, config_tree, load_config
+
+
+@dataclass(frozen=True)
+class MapArguments:
+    """Map a stereo sequence: images and poses in, a voxel map and its pictures out.
+
+    Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
+    poses.tum and report.html.
+    """
+
+    sequence: tyro.conf.Positional[str]
+    """Folder of one sequence, or sample:motorcycle."""
+    out: Path
+    """The run folder to write."""
+    config: str | None = None
+    """YAML file, or the name of a bundled one (chiodini2020); options given here go before it."""
+    resume: bool = False
+    """Go on with an interrupted run."""
+    overwrite: bool = False
+    """Replace a run that lies in the folder."""
+    checkpoint_every_s: float = 30.0
+    """How often the map is saved on the way."""
+    settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    arguments = parse(MapArguments, "map", words, with_config=_with_config)
+    config = check_config(config_tree(arguments.settings))
+
+    # JAX is imported only now: help and wrong options need not wait for it.
+    from jaxmap.cache import keep_compiled_programs
+    from jaxmap.mapping import plan_run, run_plan
+    from jaxmap.run_folder import RunFolder
+
+    keep_compiled_programs()
+    console = Console()
+    folder = RunFolder(arguments.out)
+    plan = plan_run(arguments.sequence, config, console.tell)
+    folder.begin(arguments.sequence, config, resume=arguments.resume, overwrite=arguments.overwrite)
+    with console.progress("mapping", len(plan.sequence.frames)) as advance:
+        metrics = run_plan(
+            plan,
+            folder,
+            strict=config.strict,
+            checkpoint_every_s=arguments.checkpoint_every_s,
+            tell=console.tell,
+            on_frame=advance,
+        )
+    console.tell(summary(metrics))
+    for skipped in metrics["sequence"]["skipped"]:
+        console.tell(f"skipped {skipped['frame']}: {skipped['reason']}")
+    console.result(arguments.out, ["map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "report.html"])
+    return 0
+
+
+def summary(metrics: dict) -> str:
+    """One line on what a run did."""
+    sequence, times, voxels = metrics["sequence"], metrics["times"], metrics["voxels"]
+    return (
+        f"{sequence['fused']} of {sequence['frames']} frames fused, {times['frames_per_s']:.1f} frames/s "
+        f"(compiled in {times['compile_s']:.1f} s); {voxels['occupied']:,} voxels occupied, {voxels['free']:,} free; "
+        f"peak memory {metrics['memory']['peak_resident_mib']:.0f} MiB"
+    )
+
+
+def _with_config(name: str) -> MapArguments:
+    """The defaults under a configuration; the two required arguments are filled in by the parser."""
+    return MapArguments(sequence=tyro.MISSING, out=tyro.MISSING, config=name, settings=load_config(name))

@@ -1,0 +1,29 @@
+"""`jaxmap report`: the HTML report of a run, written anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from jaxmap.commands.console import Console, parse
+
+
+@dataclass(frozen=True)
+class ReportArguments:
+    """Write report.html of a run anew, from what lies in its folder."""
+
+    run: tyro.conf.Positional[Path]
+    """A run folder, as jaxmap map has written it."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    arguments = parse(ReportArguments, "report", words)
+
+    from jaxmap.report.html import write_report
+
+    Console().result(arguments.run, [write_report(arguments.run).name])
+    return 0

@@ -1,0 +1,119 @@
+"""KITTI odometry: `sequences/NN` with rectified pairs, `calib.txt`, `times.txt`, `../../poses/NN.txt`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from jaxmap.datasets.assemble import Reader, ReadOptions, assemble, read_pose_track
+from jaxmap.datasets.base import FrameRef, StereoSequence
+from jaxmap.datasets.calibration import data_lines, read_camera_yaml
+from jaxmap.datasets.images import first_image_size_px, list_images
+from jaxmap.datasets.pose_files import read_timestamps
+from jaxmap.datasets.poses import with_timestamps
+from jaxmap.errors import JaxmapError
+from jaxmap.types import StereoCamera, make_stereo_camera
+
+_CAMERA_PAIRS = ((0, 1), (2, 3))
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder holds `calib.txt` and `image_0` or `image_2`."""
+    return (folder / "calib.txt").is_file() and any((folder / f"image_{i}").is_dir() for i, _ in _CAMERA_PAIRS)
+
+
+def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
+    """Opens one sequence: the grey pair (cameras 0 and 1), or the colour pair (2 and 3) without it.
+
+    An image's number is its line in `times.txt` and in the poses, so that a part of the images can
+    be read. KITTI's own poses are those of camera 0; for the colour pair they are moved to camera 2.
+
+    Raises:
+        JaxmapError: a file is missing or malformed, or the counts of times and poses disagree.
+    """
+    left, right = next((pair for pair in _CAMERA_PAIRS if (folder / f"image_{pair[0]}").is_dir()), _CAMERA_PAIRS[0])
+    absolute = Path(os.path.abspath(folder))
+    times_s = read_timestamps(folder / "times.txt")
+    frames = _frames(folder, left, right, times_s)
+    P_left, P_right = _projections(folder / "calib.txt", left, right)
+    if options.calibration:
+        camera = read_camera_yaml(options.calibration)
+    else:
+        camera = _camera(P_left, P_right, first_image_size_px(frames, folder), folder / "calib.txt")
+
+    own = absolute.parent.parent / "poses" / f"{absolute.name}.txt"
+    track = read_pose_track(options, own if own.is_file() else None, own)
+    if track.timestamps_s is None:
+        track = with_timestamps(track, times_s)
+    T_camera0_left = np.eye(4)
+    T_camera0_left[:3, 3] = -np.linalg.solve(P_left[:, :3], P_left[:, 3])
+    notes = [f"{len(times_s) - len(frames)} of {len(times_s)} frames have no left image"] * (len(frames) < len(times_s))
+    return assemble(
+        name=f"kitti_{absolute.name}",
+        dataset="kitti",
+        where=folder,
+        frames=frames,
+        track=track,
+        camera=camera,
+        options=options,
+        T_child_camera=None if options.poses else T_camera0_left,
+        notes=notes,
+    )
+
+
+def _frames(folder: Path, left: int, right: int, times_s: np.ndarray) -> list[FrameRef]:
+    frames = []
+    for image in list_images(folder / f"image_{left}"):
+        if not (image.stem.isascii() and image.stem.isdigit() and int(image.stem) < len(times_s)):
+            raise JaxmapError(
+                f"{image.name} is none of the {len(times_s)} frames of times.txt",
+                where=image.parent,
+                fix="name images 000000.png, 000001.png and so on, one for each line of times.txt",
+            )
+        time_s = float(times_s[int(image.stem)])
+        frames.append(FrameRef(image.stem, time_s, image, folder / f"image_{right}" / image.name))
+    return frames
+
+
+def _projections(path: Path, left: int, right: int) -> tuple[np.ndarray, np.ndarray]:
+    """The 3x4 projection matrices of two cameras."""
+    matrices = {}
+    for line, text in data_lines(path):
+        key, _, values = text.partition(":")
+        if key not in (f"P{left}", f"P{right}"):
+            continue
+        try:
+            matrices[key] = np.array([float(value) for value in values.split()]).reshape(3, 4)
+        except ValueError as fault:
+            raise JaxmapError(
+                f"{key} is not twelve numbers", where=f"{path} line {line}", fix="restore the file"
+            ) from fault
+        if not np.isfinite(matrices[key]).all() or min(matrices[key][0, 0], matrices[key][1, 1]) <= 0:
+            raise JaxmapError(f"{key} is no projection", where=f"{path} line {line}", fix="restore the file")
+        if not np.array_equal(matrices[key][[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
+            raise JaxmapError(f"{key} is no rectified camera", where=f"{path} line {line}", fix="restore the file")
+    absent = [key for key in (f"P{left}", f"P{right}") if key not in matrices]
+    if absent:
+        raise JaxmapError(f"no line {' or '.join(absent)}", where=path, fix="restore the file")
+    return matrices[f"P{left}"], matrices[f"P{right}"]
+
+
+def _camera(P_left: np.ndarray, P_right: np.ndarray, size_px: tuple[int, int], path: Path) -> StereoCamera:
+    if not np.allclose(P_left[[0, 1, 1], [0, 1, 2]], P_right[[0, 1, 1], [0, 1, 2]], rtol=1e-3):
+        raise JaxmapError("the two cameras differ", where=path, fix="give a rectified pair, or a --calibration")
+    return make_stereo_camera(
+        fx_px=float(P_left[0, 0]),
+        fy_px=float(P_left[1, 1]),
+        cx_px=float(P_left[0, 2]),
+        cy_px=float(P_left[1, 2]),
+        baseline_m=float((P_left[0, 3] - P_right[0, 3]) / P_left[0, 0]),
+        doffs_px=float(P_right[0, 2] - P_left[0, 2]),
+        width_px=size_px[0],
+        height_px=size_px[1],
+        where=path,
+    )
+
+
+READER = Reader("kitti", "KITTI odometry, sequences/NN with image_0 and calib.txt", recognises, open_kitti)

@@ -1,0 +1,100 @@
+"""Labels made elsewhere: one file for each frame, named after its left image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from jaxmap.datasets.base import FrameRef
+from jaxmap.datasets.images import read_index_image
+from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.labels import IGNORE
+from jaxmap.stereo.front_end import StereoFrontEnd
+
+
+@dataclass(frozen=True)
+class LabelFolder:
+    """A folder of `NAME.png` (class indices, 255 for none) or `NAME.npy` (probabilities (H, W, C)).
+
+    Attributes:
+        folder: where the files lie.
+        soft: whether they are probabilities.
+        class_count: the number of classes.
+        labels_are: whether they lie on the raw or on the rectified pixels of the left image.
+    """
+
+    folder: Path
+    soft: bool
+    class_count: int
+    labels_are: Literal["raw", "rectified"]
+
+    def read(self, ref: FrameRef, front_end: StereoFrontEnd) -> dict[str, np.ndarray]:
+        """The labels of one frame on its rectified pixels, as the fields of `Frame` that they fill.
+
+        Raises:
+            FrameError: the file is missing or broken, of another size, or holds what is no class.
+        """
+        path = self.folder / f"{ref.name}{'.npy' if self.soft else '.png'}"
+        labels = self._read_probabilities(path) if self.soft else self._read_indices(path)
+        expected = (front_end.camera.height_px, front_end.camera.width_px)
+        if labels.shape[:2] != expected:
+            raise FrameError(
+                f"the labels are {labels.shape[1]}x{labels.shape[0]} px, the image is {expected[1]}x{expected[0]} px",
+                where=path,
+                fix="label the left image at its own size",
+            )
+        if self.labels_are == "raw":
+            labels = front_end.rectify_labels(labels)
+        return {"class_probabilities" if self.soft else "labels": labels}
+
+    def _read_indices(self, path: Path) -> np.ndarray:
+        labels = read_index_image(path)
+        highest = labels[labels != IGNORE].max(initial=0)
+        if highest >= self.class_count:
+            raise FrameError(
+                f"label {highest}, but there are {self.class_count} classes",
+                where=path,
+                fix="give all --classes in order",
+            )
+        return labels
+
+    def _read_probabilities(self, path: Path) -> np.ndarray:
+        try:
+            array = np.load(path, allow_pickle=False)
+        except FileNotFoundError as error:
+            raise FrameError("the file is missing", where=path, fix="label every left image") from error
+        except (OSError, ValueError, EOFError) as error:
+            raise FrameError(f"not a readable array: {error}", where=path, fix="write it with numpy.save") from error
+        if array.ndim != 3 or array.shape[2] != self.class_count or array.dtype.kind != "f":
+            raise FrameError(
+                f"an array {array.shape} of {array.dtype}", where=path, fix=f"give floats (H, W, {self.class_count})"
+            )
+        array = array.astype(np.float32)
+        if not np.isfinite(array).all() or array.min() < 0 or array.sum(axis=2).max() > 1.01:
+            raise FrameError(
+                "the probabilities are not finite, not negative, or sum to more than 1",
+                where=path,
+                fix="write softmax outputs",
+            )
+        return array
+
+
+def open_label_folder(
+    folder: Path, class_count: int, labels_are: Literal["raw", "rectified"], first_name: str
+) -> LabelFolder:
+    """Opens a folder of labels; the first frame's file tells whether they are indices or probabilities.
+
+    Raises:
+        JaxmapError: no such folder, or no label for the first frame.
+    """
+    if not folder.is_dir():
+        raise JaxmapError("no such folder of labels", where=folder, fix="check --labels")
+    for suffix, soft in ((".png", False), (".npy", True)):
+        if (folder / f"{first_name}{suffix}").is_file():
+            return LabelFolder(folder, soft, class_count, labels_are)
+    raise JaxmapError(
+        f"no {first_name}.png and no {first_name}.npy", where=folder, fix="name label files after the left images"
+    )

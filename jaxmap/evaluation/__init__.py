@@ -1,0 +1,1 @@
+"""Scores: how good disparity, depth and maps are."""

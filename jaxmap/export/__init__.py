@@ -1,0 +1,1 @@
+"""Maps in the forms that other programs read: point clouds and rasters."""

@@ -1,0 +1,102 @@
+"""The view from above as a GeoTIFF."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxmap.errors import JaxmapError
+from jaxmap.files import atomic_path
+from jaxmap.fusion.query import TopDown
+from jaxmap.labels import IGNORE
+from jaxmap.types import GridSpec
+
+
+def write_geotiff(
+    path: str | os.PathLike[str],
+    top: TopDown,
+    grid: GridSpec,
+    classes: Sequence[str],
+    crs: str | None,
+    site_origin: np.ndarray,
+) -> None:
+    """Writes a north-up raster with one cell per column of voxels, float32, NaN where nothing was seen.
+
+    Bands, named by their descriptions: `label` (class index), `height_m` (of the highest occupied
+    voxel's centre, `site_origin` added), then `probability_NAME` of each class.
+
+    Raises:
+        JaxmapError: an unknown `crs`, or the disk is full or refuses.
+    """
+    site_origin = np.asarray(site_origin, np.float64)
+    bands = _bands(top, site_origin[2])
+    content = _encode(bands, grid, classes, crs, site_origin, where=path)
+    # Encoded in memory: Python reports a full disk, where GDAL may find out only while closing.
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _bands(top: TopDown, site_height_m: float) -> Float[np.ndarray, "B Y X"]:
+    observed = np.asarray(top.observed)
+    label = np.asarray(top.label)
+    bands = [
+        np.where(label == IGNORE, np.nan, label),
+        np.asarray(top.height_m, np.float64) + site_height_m,
+        *(np.where(observed, channel, np.nan) for channel in np.asarray(top.probability)),
+    ]
+    # From x east, y north to rows from the north and columns to the east.
+    return np.stack([band.T[::-1] for band in bands]).astype(np.float32)
+
+
+def _encode(
+    bands: Float[np.ndarray, "B Y X"],
+    grid: GridSpec,
+    classes: Sequence[str],
+    crs: str | None,
+    site_origin: np.ndarray,
+    where: object,
+) -> bytes:
+    import rasterio
+    from rasterio.errors import CRSError, NotGeoreferencedWarning
+    from rasterio.io import MemoryFile
+
+    count, height, width = bands.shape
+    east_m, north_m = (_decimal(size) for size in np.asarray(grid.voxel_size_m)[:2])
+    west, south = (site_origin[axis] + _decimal(np.asarray(grid.origin_m)[axis]) for axis in (0, 1))
+    try:
+        reference = rasterio.crs.CRS.from_user_input(crs) if crs else None
+    except CRSError as error:
+        raise JaxmapError(
+            f"unknown coordinate reference system {crs!r}", where=where, fix='give a name such as "EPSG:32631"'
+        ) from error
+    profile = dict(
+        driver="GTiff",
+        count=count,
+        height=height,
+        width=width,
+        dtype="float32",
+        nodata=np.nan,
+        crs=reference,
+        transform=rasterio.Affine(east_m, 0.0, west, 0.0, -north_m, south + height * north_m),
+        compress="deflate",
+        predictor=3,
+        interleave="band",
+    )
+    with warnings.catch_warnings(), MemoryFile() as memory:
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with memory.open(**profile) as raster:
+            raster.write(bands)
+            raster.descriptions = ("label", "height_m", *(f"probability_{name}" for name in classes))
+            raster.units = ("", "m", *("" for _ in classes))
+            raster.update_tags(classes=json.dumps(list(classes)))
+        return bytes(memory.getbuffer())
+
+
+def _decimal(number: np.float32) -> float:
+    """The short decimal a float32 stands for: 0.2, not 0.20000000298, as georeferences are read by people."""
+    return float(str(number))

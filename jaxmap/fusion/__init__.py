@@ -1,0 +1,1 @@
+"""From labelled points to voxel evidence, and back from voxels to answers."""

@@ -1,0 +1,1 @@
+"""Pure, jitted geometry: camera, voxel grid, plane fitting."""

@@ -1,0 +1,69 @@
+"""How large a map must be: the range a camera is good for, and the box that its views fill."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxmap.errors import JaxmapError
+from jaxmap.geometry.camera import depth_at_sigma, frustum_corners
+from jaxmap.types import GridSpec, StereoCamera, make_grid
+
+
+def usable_depth(camera: StereoCamera, max_sigma_m: float, disparity_sigma_px: float) -> float:
+    """The depth where depth noise reaches `max_sigma_m`, in whole decimetres, in metres."""
+    return float(np.floor(float(depth_at_sigma(camera, max_sigma_m, disparity_sigma_px)) * 10) / 10)
+
+
+def grid_around_views(
+    camera: StereoCamera,
+    T_world_camera: np.ndarray,
+    max_depth_m: float,
+    voxel_size_m: float | tuple[float, float, float],
+    below_above_camera_m: tuple[float, float],
+) -> GridSpec:
+    """The smallest grid, aligned to whole voxels, that holds what the cameras can see.
+
+    Args:
+        camera: the rectified camera.
+        T_world_camera: (N, 4, 4) rectified poses in the z-up world.
+        max_depth_m: the farthest depth that is mapped.
+        voxel_size_m: edges of a voxel.
+        below_above_camera_m: the grid reaches so far below the lowest camera, and so far above the
+            highest one.
+    """
+    corners_camera = np.asarray(frustum_corners(camera, max_depth_m), np.float64)
+    R, t = T_world_camera[:, :3, :3], T_world_camera[:, :3, 3]
+    corners_world = np.einsum("nij,kj->nki", R, corners_camera) + t[:, None]
+    lower, upper = corners_world.min(axis=(0, 1)), corners_world.max(axis=(0, 1))
+    lower[2] = max(lower[2], t[:, 2].min() - below_above_camera_m[0])
+    upper[2] = min(upper[2], t[:, 2].max() + below_above_camera_m[1])
+    size = np.broadcast_to(np.asarray(voxel_size_m, np.float64), (3,))
+    # On whole multiples of the voxel, so that runs over the same site share their cells.
+    return make_grid((np.floor(lower / size) * size).tolist(), (np.ceil(upper / size) * size).tolist(), size.tolist())
+
+
+def map_bytes(grid: GridSpec, class_count: int) -> int:
+    """Memory of a map's tensor, float32."""
+    return 4 * (1 + class_count) * int(np.prod(grid.shape, dtype=np.int64))
+
+
+def check_memory(grid: GridSpec, class_count: int, limit_gib: float) -> None:
+    """Refuses a map that would take more memory than allowed.
+
+    Raises:
+        JaxmapError: says what it would take and which voxel size would fit.
+    """
+    needed_gib = map_bytes(grid, class_count) / 2**30
+    if needed_gib <= limit_gib:
+        return
+    size = np.asarray(grid.voxel_size_m, np.float64)
+    # Rounded up to a centimetre: what is advised must fit.
+    fitting = np.ceil(size * (needed_gib / limit_gib) ** (1 / 3) * 100) / 100
+    advice = " ".join(f"{edge:g}" for edge in (fitting[:1] if np.ptp(fitting) == 0 else fitting))
+    raise JaxmapError(
+        f"a map of {' x '.join(map(str, grid.shape))} voxels takes {needed_gib:.1f} GiB, "
+        f"over the limit of {limit_gib:g} GiB",
+        where="grid",
+        fix=f"take larger voxels (--grid.voxel-size-m {advice}), a shorter range (--depth.max-m), "
+        "or raise --grid.max-memory-gib",
+    )

@@ -1,0 +1,89 @@
+"""Where points lie in a voxel grid, and windows of a grid that a camera can see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmap.geometry.camera import frustum_corners, transform_points
+from jaxmap.types import GridSpec, StereoCamera
+
+
+def world_to_voxel(grid: GridSpec, points_world: Float[Array, "*s 3"]) -> tuple[Int[Array, "*s 3"], Bool[Array, "*s"]]:
+    """Voxel indices of points, `floor((p - origin) / size)`.
+
+    Returns:
+        index: int32; 0 where not inside.
+        inside: the point is finite and in the grid.
+    """
+    scaled = jnp.floor((points_world - grid.origin_m) / grid.voxel_size_m)
+    # Tested on floats: a NaN or a huge number cast to int32 would be a valid index.
+    inside = jnp.all((scaled >= 0) & (scaled < jnp.array(grid.shape, jnp.float32)), axis=-1)
+    return jnp.where(inside[..., None], scaled, 0.0).astype(jnp.int32), inside
+
+
+def flat_voxel_index(grid: GridSpec, points_world: Float[Array, "*s 3"], keep: Bool[Array, "*s"]) -> Int[Array, "*s"]:
+    """Flat (row-major) voxel indices; points outside or not kept get the number of voxels.
+
+    That number is one past the end: a scatter with `mode="drop"` leaves them out exactly, where -1
+    would wrap round to the last voxel.
+    """
+    index, inside = world_to_voxel(grid, points_world)
+    _, ny, nz = grid.shape
+    flat = (index[..., 0] * ny + index[..., 1]) * nz + index[..., 2]
+    return jnp.where(inside & keep, flat, int(np.prod(grid.shape)))
+
+
+def voxel_centres(grid: GridSpec) -> Float[Array, "X Y Z 3"]:
+    """World positions of all voxel centres, in metres."""
+    axes = [grid.origin_m[i] + (jnp.arange(grid.shape[i]) + 0.5) * grid.voxel_size_m[i] for i in range(3)]
+    return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+class Window(NamedTuple):
+    """A part of a grid: the index of its first voxel, and the part as a grid of its own."""
+
+    start: Int[Array, "3"]
+    grid: GridSpec
+
+
+def whole_window(grid: GridSpec) -> Window:
+    """The window that is the whole grid."""
+    return Window(jnp.zeros(3, jnp.int32), grid)
+
+
+def window_shape(grid: GridSpec, camera: StereoCamera, max_depth_m: float) -> tuple[int, int, int]:
+    """Voxels along each axis that hold the view of the camera, however it is turned.
+
+    The view is the pyramid from the camera to `max_depth_m`; its greatest diameter bounds its
+    extent in every direction. Host side, static.
+    """
+    corners = np.asarray(frustum_corners(camera, max_depth_m), np.float64)
+    diameter_m = np.linalg.norm(corners[:, None] - corners[None], axis=-1).max()
+    # One voxel for a start that is not aligned, one more for rounding.
+    needed = np.ceil(diameter_m / np.asarray(grid.voxel_size_m, np.float64)).astype(int) + 2
+    x, y, z = (min(int(n), s) for n, s in zip(needed, grid.shape, strict=True))
+    return x, y, z
+
+
+def view_window(
+    grid: GridSpec,
+    camera: StereoCamera,
+    T_world_camera: jaxlie.SE3,
+    max_depth_m: Float[Array, ""] | float,
+    shape: tuple[int, int, int],
+) -> Window:
+    """The window of the grid, of a static `shape`, that holds all that the camera can see."""
+    with jax.named_scope("view_window"):
+        corners = transform_points(T_world_camera, frustum_corners(camera, max_depth_m))
+        first = jnp.floor((corners.min(axis=0) - grid.origin_m) / grid.voxel_size_m)
+        last_start = jnp.array(grid.shape, jnp.float32) - jnp.array(shape, jnp.float32)
+        # Clipped as floats: far outside the grid the cast would wrap round.
+        start = jnp.clip(first, 0.0, last_start).astype(jnp.int32)
+        return Window(start, replace(grid, origin_m=grid.origin_m + start * grid.voxel_size_m, shape=shape))

@@ -1,0 +1,167 @@
+"""The principal plane of a point cloud, by MLESAC: all hypotheses at once.
+
+Torr and Zisserman, "MLESAC: A new robust estimator with application to estimating image geometry",
+Computer Vision and Image Understanding 78 (2000), 138-156.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from jaxmap.types import Plane
+
+_REFIT_ROUNDS = 5
+_BLOCK = 64
+_NORMALISER = 2.5066282746  # sqrt(2 pi)
+
+
+def fit_plane_mlesac(
+    key: PRNGKeyArray,
+    points: Float[Array, "N 3"],
+    valid: Bool[Array, "N"],
+    *,
+    up_hint: Float[Array, "3"],
+    sigma_m: Float[Array, ""] | float = 0.05,
+    outlier_range_m: Float[Array, ""] | float = 4.0,
+    max_tilt_rad: float = 0.6,
+    hypotheses: int = 256,
+    sample_points: int = 8192,
+    em_rounds: int = 3,
+    cost: Literal["mlesac", "msac"] = "mlesac",
+) -> Plane:
+    """Fits the plane that most points lie on.
+
+    A residual r is drawn from `gamma N(0, sigma) + (1 - gamma) / nu` (the mixture of the paper
+    above), gamma by expectation maximisation for each hypothesis; the hypothesis with the least
+    negative log-likelihood wins and is refitted by least squares weighted with the inliers'
+    posteriors. `cost="msac"` scores hypotheses by `min(r^2, (1.96 sigma)^2)` instead, which is what
+    PCL and MATLAB's `pcfitplane` run.
+
+    Args:
+        key: the randomness of the hypotheses; the same key gives the same plane.
+        points: any frame, metres; the plane comes out in the same frame.
+        valid: which points are real.
+        up_hint: unit vector that the normal shall agree with.
+        sigma_m: standard deviation of points on the plane, along its normal.
+        outlier_range_m: nu, the range over which outliers spread evenly.
+        max_tilt_rad: hypotheses whose normal leans further from `up_hint` are rejected: walls.
+        hypotheses: number of planes tried, each through three points.
+        sample_points: number of points, drawn evenly from the valid ones, that judge them.
+        em_rounds: rounds of expectation maximisation for gamma.
+        cost: the score of a hypothesis.
+
+    Returns:
+        The plane; `found` is false where no hypothesis was acceptable, and the plane then is the
+        one through the origin across `up_hint`.
+    """
+    with jax.named_scope("mlesac"):
+        draw_key, triple_key = jax.random.split(key)
+        sample, enough = _draw_valid(draw_key, points, valid, sample_points)
+        # Centred: the moments of the refit lose no digits, however far the frame's origin is.
+        centre = sample.mean(axis=0)
+        sample = sample - centre
+        triples = jax.random.randint(triple_key, (hypotheses, 3), 0, sample_points)
+        normals, offsets, proper = _planes_through(sample[triples], up_hint)
+        acceptable = proper & (normals @ up_hint >= jnp.cos(max_tilt_rad))
+
+        def score(normal: Array, offset: Array) -> Array:
+            residuals = sample @ normal + offset
+            if cost == "msac":
+                return jnp.minimum(residuals**2, (1.96 * sigma_m) ** 2).sum()
+            # Computed once: the rounds of EM only weigh it anew.
+            density = jax.lax.optimization_barrier(_inlier_density(residuals, sigma_m))
+            gamma = _mixing(density, outlier_range_m, em_rounds)
+            return -jnp.log(gamma * density + (1.0 - gamma) / outlier_range_m).sum()
+
+        costs = jnp.where(acceptable, jax.vmap(score)(normals, offsets), jnp.inf)
+        best = jnp.argmin(costs)
+        found = acceptable[best] & enough
+        mixture = (sigma_m, outlier_range_m, em_rounds)
+        normal, offset, inliers = _refit(sample, normals[best], offsets[best], up_hint, mixture)
+        return Plane(
+            normal=jnp.where(found, normal, up_hint),
+            offset_m=jnp.where(found, offset - normal @ centre, 0.0),
+            inlier_fraction=jnp.where(found, inliers, 0.0),
+            found=found,
+        )
+
+
+def plane_distance(plane: Plane, points: Float[Array, "*s 3"]) -> Float[Array, "*s"]:
+    """Signed distance of points from a plane, in metres, positive on the side of the normal."""
+    n = plane.normal
+    return n[0] * points[..., 0] + n[1] * points[..., 1] + n[2] * points[..., 2] + plane.offset_m
+
+
+def _draw_valid(key: PRNGKeyArray, points: Array, valid: Array, count: int) -> tuple[Array, Array]:
+    """Draws points evenly, with replacement, from the valid ones; also whether there are three.
+
+    The n-th valid point is found through counts of blocks: a running sum over all points would cost
+    more than the rest of the fit.
+    """
+    blocks = jnp.pad(valid, (0, -valid.shape[0] % _BLOCK)).reshape(-1, _BLOCK)
+    upto_block = jnp.cumsum(blocks.sum(axis=1, dtype=jnp.int32))
+    total = upto_block[-1]
+    wanted = jax.random.randint(key, (count,), 0, jnp.maximum(total, 1))
+    block = jnp.minimum(jnp.searchsorted(upto_block, wanted, side="right"), blocks.shape[0] - 1)
+    members = blocks[block]
+    within = wanted - (upto_block[block] - members.sum(axis=1, dtype=jnp.int32))
+    place = jnp.argmax(jnp.cumsum(members, axis=1, dtype=jnp.int32) > within[:, None], axis=1)
+    drawn = points[jnp.minimum(block * _BLOCK + place, points.shape[0] - 1)]
+    return jnp.where(total >= 3, drawn, 0.0), total >= 3
+
+
+def _planes_through(triples: Array, up_hint: Array) -> tuple[Array, Array, Array]:
+    """Planes through three points each, normals turned to the side of the up hint."""
+    a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
+    normals = jnp.cross(b - a, c - a)
+    length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
+    proper = length[:, 0] > 1e-9
+    normals = normals / jnp.where(length > 1e-9, length, 1.0)
+    normals = normals * jnp.where(normals @ up_hint < 0, -1.0, 1.0)[:, None]
+    return normals, -(normals * a).sum(axis=-1), proper
+
+
+def _inlier_density(residuals: Array, sigma_m: Array | float) -> Array:
+    """The normal density of residuals."""
+    return jnp.exp(-0.5 * (residuals / sigma_m) ** 2) / (_NORMALISER * sigma_m)
+
+
+def _mixing(density: Array, nu_m: Array | float, rounds: int) -> Array:
+    """The share of inliers, by expectation maximisation from one half."""
+    gamma = jnp.asarray(0.5)
+    for _ in range(rounds):
+        # Kept off 0 and 1, where a single residual would have likelihood zero.
+        gamma = jnp.clip(_posterior(density, gamma, nu_m).mean(), 1e-3, 1.0 - 1e-3)
+    return gamma
+
+
+def _posterior(density: Array, gamma: Array, nu_m: Array | float) -> Array:
+    """The probability that a point is an inlier."""
+    return gamma * density / (gamma * density + (1.0 - gamma) / nu_m)
+
+
+def _refit(
+    sample: Array,
+    normal: Array,
+    offset: Array,
+    up_hint: Array,
+    mixture: tuple[Array | float, Array | float, int],
+) -> tuple[Array, Array, Array]:
+    """Least squares on inlier posteriors, a few rounds; also the share of inliers."""
+    sigma_m, nu_m, em_rounds = mixture
+    gamma = jnp.asarray(0.5)
+    for _ in range(_REFIT_ROUNDS):
+        density = _inlier_density(sample @ normal + offset, sigma_m)
+        gamma = _mixing(density, nu_m, em_rounds)
+        weights = _posterior(density, gamma, nu_m)
+        total = jnp.maximum(weights.sum(), 1e-9)
+        mean = weights @ sample / total
+        spread = sample - mean
+        _, vectors = jnp.linalg.eigh((weights[:, None] * spread).T @ spread / total)
+        normal = vectors[:, 0] * jnp.where(vectors[:, 0] @ up_hint < 0, -1.0, 1.0)
+        offset = -normal @ mean
+    return normal, offset, gamma

@@ -1,0 +1,223 @@
+"""The compiled step: one stereo frame into the map, as one jitted function."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PRNGKeyArray, UInt8
+
+from jaxmap.errors import JaxmapError
+from jaxmap.fusion.carve import carve
+from jaxmap.fusion.integrate import integrate
+from jaxmap.fusion.sensor_model import range_weight
+from jaxmap.geometry.camera import disparity_to_points, transform_points
+from jaxmap.geometry.grid import view_window, window_shape
+from jaxmap.labellers import Labeller, harden
+from jaxmap.labels import IGNORE
+from jaxmap.types import (
+    Frame,
+    FusionParams,
+    FusionRule,
+    GridSpec,
+    Plane,
+    PointLabels,
+    StereoCamera,
+    VoxelMap,
+    make_voxel_map,
+)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MapperParams:
+    """All the numbers the step depends on; every leaf is differentiable."""
+
+    camera: StereoCamera
+    fusion: FusionParams
+
+
+class StepInfo(NamedTuple):
+    """What one step did.
+
+    `points_valid` have a disparity, `points_in_range` lie between the depths, `points_kept` were
+    kept by the labeller; `voxels_hit` hold points, `voxels_freed` were seen through; `plane` is the
+    labeller's, or None.
+    """
+
+    points_valid: Int[Array, ""]
+    points_in_range: Int[Array, ""]
+    points_kept: Int[Array, ""]
+    voxels_hit: Int[Array, ""]
+    voxels_freed: Int[Array, ""]
+    plane: Plane | None
+
+
+class Mapper(NamedTuple):
+    """The pure functions of a mapper.
+
+    Attributes:
+        init: `() -> VoxelMap`, an empty map.
+        step: `(voxel_map, frame, params, key) -> (voxel_map, StepInfo)`, compiled once; the map
+            passed in is donated: its tensor must not be used again. The key is the run's: the step folds
+            the number of fused frames into it.
+        fuse: the same function, not jitted and donating nothing, to be composed and differentiated.
+        scan: `(voxel_map, frames, params, key) -> (voxel_map, StepInfo)` over frames stacked along
+            a leading axis, equal to a loop over `step`.
+        label_image: `(frame, params, key, number) -> uint8 (H, W)`, the labels that the step gives
+            the pixels of the frame when `number` frames were fused before it; `IGNORE` where none.
+        lower: the arguments of `step` -> `jax.stages.Lowered`, for its cost, memory and HLO.
+        compilations: how often `step` has been compiled so far.
+    """
+
+    init: Callable[[], VoxelMap]
+    step: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepInfo]]
+    fuse: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepInfo]]
+    scan: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepInfo]]
+    label_image: Callable[[Frame, MapperParams, PRNGKeyArray, int], UInt8[Array, "H W"]]
+    lower: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], jax.stages.Lowered]
+    compilations: Callable[[], int]
+
+
+def make_mapper(
+    camera: StereoCamera,
+    grid: GridSpec,
+    labeller: Labeller,
+    rule: FusionRule,
+    depth_range_m: tuple[float, float],
+) -> Mapper:
+    """Builds a mapper.
+
+    Args:
+        camera: fixes the image size and the window of voxels a frame can touch; the camera that the
+            step computes with is that of its params.
+        grid: the bounds of the map.
+        labeller: gives each point its class.
+        rule: the discrete choices of fusion.
+        depth_range_m: points nearer or farther than these are left out.
+
+    Raises:
+        JaxmapError: a depth range that is none.
+    """
+    min_depth_m, max_depth_m = depth_range_m
+    if not 0 <= min_depth_m < max_depth_m:
+        raise JaxmapError(f"depth range {min_depth_m} to {max_depth_m} m", where="mapper", fix="take 0 <= min < max")
+    window_size = window_shape(grid, camera, max_depth_m)
+
+    def init() -> VoxelMap:
+        return make_voxel_map(grid, labeller.classes)
+
+    def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
+        """The labelled points of a frame; `key` is the frame's own."""
+        points_camera, valid = disparity_to_points(params.camera, frame.disparity_px)
+        depth_m = points_camera[..., 2]
+        in_range = valid & (depth_m >= min_depth_m) & (depth_m <= max_depth_m)
+        points_world = transform_points(frame.T_world_camera, points_camera).reshape(-1, 3)
+        # Kept apart: labeller and scatter would each compute the points anew, one by one.
+        points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
+        labels, plane = labeller.label(frame, points_world, in_range.reshape(-1), key)
+        return _Observation(depth_m, valid, in_range, points_world, labels, plane)
+
+    def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
+        seen = observe(frame, params, jax.random.fold_in(key, voxel_map.frames_fused))
+        depth_m = seen.depth_m
+        labels = harden(seen.labels) if rule.per_frame == "once" else seen.labels
+
+        window = view_window(voxel_map.grid, params.camera, frame.T_world_camera, max_depth_m, window_size)
+        weights = jnp.ones(depth_m.size, jnp.float32)
+        if rule.range_weighting:
+            weights = range_weight(params.camera, window.grid, depth_m.reshape(-1), params.fusion)
+        free = None
+        if rule.carve:
+            free = carve(
+                params.camera,
+                frame.T_world_camera,
+                depth_m,
+                seen.valid,
+                window.grid,
+                params.fusion,
+                depth_range_m=depth_range_m,
+            )
+        voxel_map, hits = integrate(
+            voxel_map, seen.points_world, labels, weights, params.fusion, rule, window=window, free=free
+        )
+        info = StepInfo(
+            points_valid=seen.valid.sum(),
+            points_in_range=seen.in_range.sum(),
+            points_kept=labels.keep.sum(),
+            voxels_hit=(hits > 0).sum(),
+            voxels_freed=(free & (hits == 0)).sum() if free is not None else jnp.zeros((), jnp.int32),
+            plane=seen.plane,
+        )
+        return voxel_map, info
+
+    def scan(voxel_map: VoxelMap, frames: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
+        return jax.lax.scan(lambda carried, frame: fuse(carried, frame, params, key), voxel_map, frames)
+
+    def fuse_donated(log_odds: Array, rest: VoxelMap, *inputs: Any) -> tuple[VoxelMap, StepInfo]:
+        return fuse(replace(rest, log_odds=log_odds), *inputs)
+
+    # Only the tensor is donated: the small arrays of the grid may be shared with other maps.
+    compiled: Any = jax.jit(fuse_donated, donate_argnums=0)
+
+    def step(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
+        return compiled(*_apart(voxel_map), frame, params, key)
+
+    def lower(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> jax.stages.Lowered:
+        return compiled.lower(*_apart(voxel_map), frame, params, key)
+
+    @jax.jit
+    def label_image(frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]) -> Array:
+        labels = harden(observe(frame, params, jax.random.fold_in(key, number)).labels)
+        assert labels.labels is not None
+        hard = jnp.where(labels.keep, labels.labels, IGNORE)
+        return hard.astype(jnp.uint8).reshape(frame.disparity_px.shape)
+
+    return Mapper(init, step, fuse, jax.jit(scan), label_image, lower, compiled._cache_size)
+
+
+class StepCost(NamedTuple):
+    """What the compiler says of a step: time to compile it, and memory it takes beside the map."""
+
+    compile_s: float
+    temporary_bytes: int
+
+
+def compile_step(
+    mapper: Mapper, voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray
+) -> tuple[Mapper, StepCost]:
+    """Compiles the step ahead of its first use.
+
+    Returns:
+        A mapper whose step takes frames of just this size and kind, and refuses others; and what
+        the compiler says of it.
+    """
+    started_s = time.perf_counter()
+    executable = mapper.lower(voxel_map, frame, params, key).compile()
+    compile_s = time.perf_counter() - started_s
+    memory = executable.memory_analysis()
+
+    def step(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
+        return executable(*_apart(voxel_map), frame, params, key)
+
+    return mapper._replace(step=step), StepCost(compile_s, memory.temp_size_in_bytes if memory else 0)
+
+
+class _Observation(NamedTuple):
+    """The labelled points of one frame; images are (H, W), lists (H W)."""
+
+    depth_m: Array
+    valid: Array
+    in_range: Array
+    points_world: Array
+    labels: PointLabels
+    plane: Plane | None
+
+
+def _apart(voxel_map: VoxelMap) -> tuple[Array, VoxelMap]:
+    """The tensor of a map, and the map without it."""
+    return voxel_map.log_odds, replace(voxel_map, log_odds=None)

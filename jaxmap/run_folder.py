@@ -1,0 +1,181 @@
+"""The folder of one mapping run: what lies in it, what a run has logged, and where it can go on."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmap.config import MapConfig, config_tree
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.files import atomic_path
+from jaxmap.map_store import load_map
+from jaxmap.sequence import FusedFrame
+from jaxmap.types import VoxelMap
+
+
+@dataclass
+class RunLog:
+    """What a run has done so far; it is saved with the map, so that a resumed run goes on counting.
+
+    Attributes:
+        next_index: the frame to go on with.
+        fused: names of the fused frames.
+        skipped: the others, each with its reason.
+        stages_ms: what each stage took, for each frame.
+        valid_fractions: share of pixels with a disparity, for each frame.
+        points_fused: points that the labeller kept.
+        total_s: time spent on frames.
+        compile_s: time spent on compiling.
+        complete: whether the run has come to its end.
+    """
+
+    next_index: int = 0
+    fused: list[str] = field(default_factory=list)
+    skipped: list[dict[str, str]] = field(default_factory=list)
+    stages_ms: dict[str, list[float]] = field(default_factory=dict)
+    valid_fractions: list[float] = field(default_factory=list)
+    points_fused: int = 0
+    total_s: float = 0.0
+    compile_s: float = 0.0
+    complete: bool = False
+
+    def add(self, fused: FusedFrame) -> None:
+        """Takes note of one frame."""
+        prepared = fused.prepared
+        self.next_index = prepared.index + 1
+        if fused.info is None:
+            self.skipped.append({"frame": prepared.ref.name, "reason": str(prepared.fault)})
+            return
+        self.fused.append(prepared.ref.name)
+        for name, seconds in prepared.stages_s.items():
+            self.stages_ms.setdefault(name, []).append(round(1e3 * seconds, 3))
+        pixels = prepared.rectified.disparity_px.size if prepared.rectified is not None else 1
+        self.valid_fractions.append(round(int(fused.info.points_valid) / pixels, 4))
+        self.points_fused += int(fused.info.points_kept)
+
+    def as_json(self) -> dict[str, Any]:
+        """The log as plain values."""
+        return asdict(self)
+
+    def stage_summary(self) -> dict[str, dict[str, float]]:
+        """Median, 95th percentile (milliseconds) and total (seconds) of each stage."""
+        return {
+            name: {
+                "median_ms": round(float(np.median(times)), 3),
+                "p95_ms": round(float(np.percentile(times, 95)), 3),
+                "total_s": round(float(np.sum(times)) / 1e3, 3),
+            }
+            for name, times in self.stages_ms.items()
+            if times
+        }
+
+
+class RunFolder:
+    """Paths and bookkeeping of one run folder."""
+
+    def __init__(self, path: Path) -> None:
+        """Names the files; nothing is read or written yet."""
+        self.path = path
+        self.map = path / "map.zarr"
+        self.ply = path / "map.ply"
+        self.geotiff = path / "bev.tif"
+        self.picture = path / "bev.png"
+        self.metrics = path / "metrics.json"
+        self.config = path / "config.yaml"
+        self.poses = path / "poses.tum"
+        self.pictures = path / "pictures"
+
+    def begin(self, sequence: str, config: MapConfig, *, resume: bool, overwrite: bool) -> None:
+        """Makes the folder and writes the resolved configuration, or checks that a run can go on.
+
+        Raises:
+            JaxmapError: the folder holds a run already, or cannot be made.
+            UsageError: the run to be resumed had other settings.
+        """
+        tree = {"sequence": sequence, **config_tree(config)}
+        if self.config.exists() and resume:
+            self._check_same(tree)
+            return
+        if self.config.exists() and not overwrite:
+            raise JaxmapError(
+                "the folder holds a run already",
+                where=self.path,
+                fix="go on with it (--resume), replace it (--overwrite), or choose another folder",
+            )
+        try:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise JaxmapError(
+                f"cannot be made: {error.strerror}", where=self.path, fix="choose another --out"
+            ) from error
+        if overwrite:
+            self._clear()
+        write_yaml(self.config, tree)
+
+    def resume_point(self) -> tuple[VoxelMap, RunLog] | None:
+        """The map and log that an interrupted run has saved, or None where it has saved none.
+
+        Raises:
+            JaxmapError: there is a map, but it cannot be read.
+        """
+        try:
+            voxel_map, attributes = load_map(self.map)
+        except JaxmapError:
+            if self.map.exists():
+                raise
+            return None
+        return voxel_map, RunLog(**attributes.progress)
+
+    def _check_same(self, tree: dict[str, Any]) -> None:
+        import yaml
+
+        try:
+            before = yaml.safe_load(self.config.read_text(encoding="utf8"))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise JaxmapError(
+                f"cannot be read: {error}", where=self.config, fix="start anew with --overwrite"
+            ) from error
+        before = before if isinstance(before, dict) else {}
+        differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))
+        if differing:
+            raise UsageError(
+                f"the run was begun with another {', '.join(differing)}",
+                where=self.config,
+                fix="resume with the same settings, or start anew with --overwrite",
+            )
+
+    def _clear(self) -> None:
+        """Removes what an earlier run has written, and nothing else."""
+        import shutil
+
+        shutil.rmtree(self.map, ignore_errors=True)
+        for file in (self.ply, self.geotiff, self.picture, self.metrics, self.poses, self.path / "report.html"):
+            file.unlink(missing_ok=True)
+        for picture in self.pictures.glob("*.png"):
+            picture.unlink()
+
+
+def write_yaml(path: Path, tree: dict[str, Any]) -> None:
+    """Writes plain values as YAML, atomically."""
+    import yaml
+
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf8")
+
+
+def write_json(path: Path, tree: Any) -> None:
+    """Writes plain values as JSON, atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf8")
+
+
+def peak_resident_mib() -> float:
+    """The greatest resident size of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)

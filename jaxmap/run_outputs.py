@@ -1,0 +1,102 @@
+"""What a run writes beside its map: pictures, PLY, GeoTIFF, poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxmap.datasets.pose_files import read_poses, write_tum
+from jaxmap.errors import JaxmapError
+from jaxmap.export.geotiff import write_geotiff
+from jaxmap.export.ply import write_ply
+from jaxmap.export.voxels import occupied_voxels
+from jaxmap.files import atomic_path
+from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
+from jaxmap.map_store import MapAttributes
+from jaxmap.report.pictures import colourise_disparity, overlay_labels, top_down_picture
+from jaxmap.run_folder import RunFolder
+from jaxmap.stereo.front_end import RectifiedFrame
+from jaxmap.types import FusionParams, FusionRule, VoxelMap, make_fusion_params
+
+
+def stored_fusion(attributes: MapAttributes, classes: tuple[str, ...]) -> tuple[FusionParams, FusionRule]:
+    """The parameters and the rule that a map was fused with, from its attributes.
+
+    Raises:
+        JaxmapError: the attributes hold none, or some that this version does not know.
+    """
+    try:
+        rule = dict(attributes.fusion["rule"])
+        rule["priority_classes"] = tuple(rule["priority_classes"])
+        return make_fusion_params(classes, **attributes.fusion["params"]), FusionRule(**rule)
+    except (KeyError, TypeError) as error:
+        raise JaxmapError(
+            f"the map's fusion attributes cannot be used: {error}", fix="map the sequence again"
+        ) from error
+
+
+def write_poses(
+    folder: RunFolder,
+    timestamps_s: Float[np.ndarray, "N"],
+    T_world_camera: Float[np.ndarray, "N 4 4"],
+    site_origin: Float[np.ndarray, "3"],
+) -> None:
+    """Writes the poses of the fused frames, absolute (site origin added), in the z-up world."""
+    absolute = np.array(T_world_camera, np.float64)
+    absolute[:, :3, 3] += site_origin
+    write_tum(folder.poses, timestamps_s, absolute)
+
+
+def write_key_frame(
+    folder: RunFolder, index: int, rectified: RectifiedFrame, labels: np.ndarray | None, classes: tuple[str, ...]
+) -> None:
+    """Writes the pictures of one frame: left image, disparity and, where there are any, labels."""
+    pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
+    if labels is not None:
+        pictures["labels"] = overlay_labels(rectified.left, labels, classes)
+    for kind, picture in pictures.items():
+        _write_image(folder, f"{index:06d}_{kind}.png", picture)
+
+
+EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.png"}
+"""The file that each form of a map goes into."""
+
+
+def write_exports(
+    folder: RunFolder, voxel_map: VoxelMap, attributes: MapAttributes, formats: Sequence[str] = tuple(EXPORTS)
+) -> None:
+    """Writes the map in other forms; the picture shows the path of poses.tum, where there is one."""
+    params, rule = stored_fusion(attributes, voxel_map.classes)
+    if "ply" in formats:
+        write_ply(folder.ply, occupied_voxels(voxel_map, params, rule), voxel_map.classes, attributes.site_origin)
+    top: TopDown = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
+    if "geotiff" in formats:
+        write_geotiff(folder.geotiff, top, voxel_map.grid, voxel_map.classes, attributes.crs, attributes.site_origin)
+    if "png" in formats:
+        path_world = None
+        if folder.poses.exists():
+            path_world = read_poses(folder.poses).T[:, :3, 3] - attributes.site_origin
+        top_down_picture(top, voxel_map.grid, voxel_map.classes, path_world, folder.picture)
+
+
+def count_voxels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> dict[str, Any]:
+    """How many voxels were observed, are occupied or free, and have each class."""
+    seen, solid = observed(voxel_map), occupied(voxel_map, params)
+    labels = np.bincount(np.asarray(voxel_labels(voxel_map, params, rule)).ravel(), minlength=256)
+    return {
+        "observed": int(seen.sum()),
+        "occupied": int(solid.sum()),
+        "free": int((seen & ~solid).sum()),
+        "by_class": {name: int(labels[index]) for index, name in enumerate(voxel_map.classes)},
+    }
+
+
+def _write_image(folder: RunFolder, name: str, picture: np.ndarray) -> None:
+    from PIL import Image
+
+    with atomic_path(folder.pictures / name) as temporary:
+        Image.fromarray(picture).save(temporary)

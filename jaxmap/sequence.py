@@ -1,0 +1,155 @@
+"""Running a sequence: frames are read and matched ahead in threads while the step computes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import PRNGKeyArray
+
+from jaxmap.datasets.base import FrameRef, StereoSequence
+from jaxmap.datasets.label_files import LabelFolder
+from jaxmap.errors import FrameError
+from jaxmap.mapper import Mapper, MapperParams, StepCost, StepInfo, compile_step
+from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
+from jaxmap.types import Frame, VoxelMap
+
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame on its way to the step: ready, or with the reason why it is not.
+
+    `stages_s` holds what each host stage took.
+    """
+
+    index: int
+    ref: FrameRef
+    frame: Frame | None = None
+    rectified: RectifiedFrame | None = None
+    fault: FrameError | None = None
+    stages_s: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FusedFrame:
+    """What became of one frame.
+
+    `info` is None where it was skipped; `cost` is that of compiling the step, with the first frame.
+    """
+
+    prepared: PreparedFrame
+    info: StepInfo | None = None
+    cost: StepCost | None = None
+
+
+def prefetch(function: Callable[[In], Out], items: Iterable[In], workers: int, ahead: int) -> Iterator[Out]:
+    """Maps a function over items in threads, in order, at most `ahead` results before they are taken."""
+    source = iter(items)
+    pending: deque[Future[Out]] = deque()
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="jaxmap")
+    try:
+        for item in source:
+            pending.append(pool.submit(function, item))
+            if len(pending) >= ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def prepare_frames(
+    sequence: StereoSequence,
+    front_end: StereoFrontEnd,
+    label_folder: LabelFolder | None = None,
+    *,
+    first: int = 0,
+    workers: int = 2,
+    ahead: int = 4,
+) -> Iterator[PreparedFrame]:
+    """Reads, rectifies and matches the frames of a sequence ahead of their use.
+
+    Args:
+        sequence: the frames and their poses.
+        front_end: rectification and matching.
+        label_folder: where each frame's labels lie, for the `files` labeller.
+        first: index of the first frame.
+        workers: threads.
+        ahead: frames in the making or waiting, which bounds the memory.
+
+    Raises:
+        JaxmapError: the first readable pair has left and right swapped.
+    """
+    T_world_camera = sequence.T_world_camera @ front_end.T_raw_rectified
+    order_checked = threading.Event()
+
+    def prepare(index: int) -> PreparedFrame:
+        ref = sequence.frames[index]
+        try:
+            started_s = time.perf_counter()
+            pair = sequence.read_pair(ref)
+            stages_s = {"read": time.perf_counter() - started_s}
+            rectified = front_end(pair.left, pair.right)
+            stages_s |= {"rectify": rectified.rectify_s, "match": rectified.match_s}
+            if not order_checked.is_set():
+                order_checked.set()
+                front_end.check_order(rectified)
+            labels: dict[str, Any] = {}
+            if label_folder is not None:
+                started_s = time.perf_counter()
+                labels = label_folder.read(ref, front_end)
+                stages_s["labels"] = time.perf_counter() - started_s
+            pose = jaxlie.SE3.from_matrix(jnp.asarray(T_world_camera[index], jnp.float32))
+            frame = Frame(jnp.asarray(rectified.disparity_px), pose, **labels)
+        except FrameError as fault:
+            return PreparedFrame(index, ref, fault=fault)
+        return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)
+
+    return prefetch(prepare, range(first, len(sequence.frames)), workers, ahead)
+
+
+def run_sequence(
+    mapper: Mapper,
+    voxel_map: VoxelMap,
+    frames: Iterable[PreparedFrame],
+    params: MapperParams,
+    key: PRNGKeyArray,
+    *,
+    strict: bool = False,
+) -> Iterator[tuple[VoxelMap, FusedFrame]]:
+    """Fuses prepared frames one after the other; the first one that is ready compiles the step.
+
+    Yields:
+        After each frame, the map so far and what became of the frame. The map is donated to the
+        next frame: copy what shall last.
+
+    Raises:
+        FrameError: a frame cannot be used and `strict` is set; otherwise it is skipped.
+    """
+    cost: StepCost | None = None
+    for prepared in frames:
+        if prepared.frame is None:
+            if strict and prepared.fault is not None:
+                raise prepared.fault
+            yield voxel_map, FusedFrame(prepared)
+            continue
+        news = None
+        if cost is None:
+            mapper, cost = compile_step(mapper, voxel_map, prepared.frame, params, key)
+            news = cost
+        started_s = time.perf_counter()
+        voxel_map, info = mapper.step(voxel_map, prepared.frame, params, key)
+        jax.block_until_ready(voxel_map.log_odds)
+        prepared.stages_s["step"] = time.perf_counter() - started_s
+        yield voxel_map, FusedFrame(prepared, info, news)

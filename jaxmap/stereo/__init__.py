@@ -1,0 +1,1 @@
+"""Host side of stereo: rectification and matching by OpenCV."""

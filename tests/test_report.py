@@ -1,0 +1,388 @@
+"""The 3D view and the page of a run."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from jaxmap.errors import JaxmapError
+from jaxmap.export.voxels import OccupiedVoxels
+from jaxmap.labels import IGNORE, ROVER_CLASSES
+from jaxmap.map_store import MapAttributes, save_map
+from jaxmap.report import voxel_view as voxel_view_module
+from jaxmap.report.faces import exposed_faces, merge_voxels
+from jaxmap.report.html import MAX_KEY_FRAMES, write_report
+from jaxmap.report.voxel_view import voxel_view
+from jaxmap.report.wording import name_and_unit, number_text, value_text
+from jaxmap.types import VoxelMap, make_grid, make_voxel_map
+
+SITE = np.array([588123.4, 5790321.6, 3.25])
+NASTY = '<script>alert("x")</script> & co'
+
+
+def make_run(run: Path, *, classes: tuple[str, ...] = ROVER_CLASSES, name: str = "beach, part 1") -> Path:
+    """A run folder with a bumpy ground, a few rocks and two key frames."""
+    (run / "pictures").mkdir(parents=True)
+    grid = make_grid([-4, -3, -1], [8, 5, 1.4], 0.2)
+    x, y = np.meshgrid(np.arange(grid.shape[0]), np.arange(grid.shape[1]), indexing="ij")
+    rock = np.hypot(x % 20 - 10, y % 15 - 7) < 3
+    z = np.round(3 + 1.5 * np.sin(x / 7) + np.cos(y / 5) + 3 * rock).astype(int).clip(0, grid.shape[2] - 1)
+    log_odds = np.zeros((1 + len(classes), *grid.shape), np.float32)
+    log_odds[0, x, y, z] = 2.0
+    for index, label in enumerate(classes):
+        log_odds[1 + index, x, y, z] = np.where(rock == (label == "rock"), 1.5 if label != "background" else -2.0, -1.5)
+    voxel_map = make_voxel_map(grid, classes)
+    voxel_map = VoxelMap(jnp.asarray(log_odds), jnp.asarray(40), grid, tuple(classes))
+    fusion = {"params": {"occupancy_threshold": 0.6, "class_prior": 0.4}, "rule": {"priority_classes": ["rock"]}}
+    save_map(run / "map.zarr", voxel_map, MapAttributes(crs="EPSG:32631", site_origin=SITE, fusion=fusion))
+    positions = np.stack([np.linspace(-3, 6, 20), np.linspace(0, 2, 20), np.full(20, 1.2)], axis=-1) + SITE
+    lines = [f"{i} {px:.6f} {py:.6f} {pz:.6f} 0 0 0 1" for i, (px, py, pz) in enumerate(positions)]
+    (run / "poses.tum").write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]))
+    (run / "config.yaml").write_text(f"name: {NASTY}\n")
+    for frame in ("000000", "000020"):
+        for kind, colour in (("left", 120), ("disparity", 60), ("labels", 200)):
+            Image.new("RGB", (800, 600), (colour, colour, 90)).save(run / "pictures" / f"{frame}_{kind}.png")
+    Image.new("RGB", (300, 200), (240, 240, 240)).save(run / "bev.png")
+    (run / "map.ply").write_bytes(b"ply")
+    metrics = {
+        "jaxmap_version": "0.1.0",
+        "sequence": {
+            "name": name,
+            "dataset": "folder",
+            "frames": 42,
+            "fused": 40,
+            "skipped": [{"frame": "left_7", "reason": "no pose within 0.2 s"}],
+            "path_length_m": 9.2,
+            "notes": ["heading from motion"],
+        },
+        "grid": {"shape": [60, 40, 12], "voxel_size_m": [0.2, 0.2, 0.2], "depth_range_m": [1.0, 8.5]},
+        "labeller": "deeplab",
+        "times": {"frames_per_s": 4.8, "stages": {"match": {"median_ms": 61.5, "p95_ms": 70.0, "total_s": 2.5}}},
+        "points": {"valid_fraction": 0.812},
+        "voxels": {"by_class": {"sand": 1800, "rock": 600}},
+        "memory": {"peak_resident_mib": 1434.0},
+        "unheard_of": {"new_number_m": 1.25},
+    }
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    return run
+
+
+def voxels_of(index: np.ndarray, label: np.ndarray | None = None, size_m=(0.2, 0.3, 0.1)) -> OccupiedVoxels:
+    index = np.asarray(index, np.int32).reshape(-1, 3)
+    size = np.array(size_m, np.float32)
+    label = np.full(len(index), 1, np.uint8) if label is None else label.astype(np.uint8)
+    return OccupiedVoxels(
+        index, ((index + 0.5) * size).astype(np.float32), label, np.full(len(index), 0.9, np.float32), size
+    )
+
+
+solids = hnp.arrays(bool, st.tuples(*[st.integers(1, 5)] * 3))
+
+
+@settings(max_examples=60, deadline=None)
+@given(solids)
+def test_exposed_faces_close_the_voxels(solid) -> None:
+    index = np.argwhere(solid)
+    faces = exposed_faces(index)
+    padded = np.pad(solid, 1)
+    expected = sum(int((padded & ~np.roll(padded, step, axis)).sum()) for axis in range(3) for step in (1, -1))
+    assert len(faces.voxel) == expected
+    assert len(faces.triangle) == 2 * expected
+    assert len(np.unique(faces.corner, axis=0)) == len(faces.corner)
+    corners = faces.corner[faces.triangle].astype(float)
+    # Outward triangles of a closed surface span its volume, by the divergence theorem.
+    volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert volume == pytest.approx(solid.sum())
+    middle = corners.mean(axis=1) - (index[np.repeat(faces.voxel, 2)] + 0.5 if len(index) else 0)
+    assert (np.abs(middle).max(axis=-1, initial=0) < 0.5 + 1e-9).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(solids)
+def test_undersides_can_be_left_out(solid) -> None:
+    index = np.argwhere(solid)
+    down = int((np.pad(solid, 1) & ~np.roll(np.pad(solid, 1), 1, 2)).sum())
+    assert len(exposed_faces(index).voxel) - len(exposed_faces(index, undersides=False).voxel) == down
+
+
+@settings(max_examples=60, deadline=None)
+@given(solids, st.integers(0, 1000), st.integers(-4, 4))
+def test_merged_voxels_carry_the_label_of_most(solid, seed, shift) -> None:
+    index = np.argwhere(solid) + 2 * shift
+    label = np.random.default_rng(seed).choice([0, 1, 2, IGNORE], len(index)).astype(np.uint8)
+    merged, labels = merge_voxels(index, label)
+    assert {tuple(i) for i in merged} == {tuple(i) for i in index // 2}
+    assert len(merged) == len(np.unique(merged, axis=0))
+    for parent, chosen in zip(merged, labels, strict=True):
+        counts = np.bincount(label[(index // 2 == parent).all(axis=1)], minlength=256)
+        assert chosen == counts.argmax()
+
+
+def test_view_is_in_metres_with_a_toggle_and_the_path() -> None:
+    index = np.argwhere(np.ones((4, 3, 1), bool))
+    label = np.where(index[:, 0] < 2, 1, 2)
+    path_world = np.array([[0.0, 0, 1], [0.8, 0.9, 1], [np.nan] * 3])
+    figure, caption = voxel_view(voxels_of(index, label), ROVER_CLASSES, path_world)
+    mesh, line, ends = figure.data
+    assert (mesh.x.min(), mesh.x.max()) == (0, np.float32(0.8))
+    assert (mesh.z.min(), mesh.z.max()) == (0, np.float32(0.1))
+    assert len(mesh.intensity) == len(mesh.i)
+    assert list(mesh.colorbar.ticktext) == ["sand", "rock"]
+    assert len(line.x) == 2
+    assert len(ends.x) == 2
+    assert [button.label for button in figure.layout.updatemenus[0].buttons] == ["Classes", "Height"]
+    scene = figure.layout.scene
+    spans_m = [axis.range[1] - axis.range[0] for axis in (scene.xaxis, scene.yaxis, scene.zaxis)]
+    ratio = [scene.aspectratio.x, scene.aspectratio.y, scene.aspectratio.z]
+    assert np.ptp(np.array(ratio) / spans_m) < 1e-6
+    assert caption == "12 occupied voxels of 0.2 × 0.3 × 0.1 m."
+    content = figure.to_json()
+    assert "bdata" in content
+    assert "NaN" not in content
+
+
+def test_view_is_coarsened_and_says_so(monkeypatch) -> None:
+    monkeypatch.setattr(voxel_view_module, "MAX_FACES", 100)
+    figure, caption = voxel_view(voxels_of(np.argwhere(np.ones((20, 20, 2), bool))), ROVER_CLASSES)
+    assert caption.startswith("800 occupied voxels, drawn as 25 of 0.8 × 1.2 × 0.4 m: 4 × 4 × 4 voxels merged into one")
+    assert len(figure.data[0].i) <= 200
+    assert (figure.data[0].x.min(), figure.data[0].x.max()) == (0, 4)
+
+
+def test_view_without_classes_and_without_voxels() -> None:
+    figure, _ = voxel_view(voxels_of([[0, 0, 0]], np.array([IGNORE])), ())
+    assert not figure.layout.updatemenus
+    figure, caption = voxel_view(voxels_of(np.zeros((0, 3))), ROVER_CLASSES)
+    assert not figure.data
+    assert caption.startswith("0 occupied voxels")
+
+
+class Page(HTMLParser):
+    """What a page holds: its tags with their attributes, and its text outside scripts."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text, self.scripts, self._in = "", [], ""
+        self.feed(content)
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._in = tag
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, _tag) -> None:
+        self._in = ""
+
+    def handle_data(self, data) -> None:
+        if self._in == "script":
+            self.scripts[-1] += data
+        elif self._in != "style":
+            self.text += data + "\n"
+
+    def all(self, name: str) -> list[dict[str, str | None]]:
+        return [attributes for tag, attributes in self.tags if tag == name]
+
+
+@pytest.fixture(scope="module")
+def made_run(tmp_path_factory) -> Path:
+    run = make_run(tmp_path_factory.mktemp("runs") / "run", name=NASTY)
+    assert write_report(run) == run / "report.html"
+    return run
+
+
+@pytest.fixture
+def run_folder(made_run, tmp_path) -> Path:
+    run = tmp_path / "run"
+    shutil.copytree(made_run, run)
+    (run / "report.html").unlink()
+    return run
+
+
+def page_of(run: Path) -> Page:
+    return Page((run / "report.html").read_text(encoding="utf-8"))
+
+
+def test_page_tells_the_run(made_run) -> None:
+    page = page_of(made_run)
+    text = page.text.replace("\N{NO-BREAK SPACE}", " ").replace("\N{NARROW NO-BREAK SPACE}", " ")
+    for expected in (
+        *("From above", "In 3D", "Key frames", "Frame 000020", "Figures", "Skipped frames", "Notes", "Configuration"),
+        *("folder · labels: deeplab · EPSG:32631", "40", "9.2 m", "4.8", "1.4 GiB", "96 m²", "2 400"),
+        *("left_7", "no pose within 0.2 s", "heading from motion", "61.5", "81.2 %", "New number", "1.25 m"),
+        *("60 × 40 × 12", "1, 8.5 m", "Made by jaxmap 0.1.0."),
+    ):
+        assert expected in text, expected
+    assert sum(line in ("sand", "rock") for line in text.splitlines()) == 2
+
+
+def test_page_holds_everything_itself(made_run) -> None:
+    content = (made_run / "report.html").read_text(encoding="utf-8")
+    page = Page(content)
+    images = page.all("img")
+    assert len(images) == 7
+    assert all(image["src"].startswith("data:image/") and image["alt"] and image["width"] for image in images)
+    assert [a["href"] for a in page.all("a")] == [
+        "map.zarr",
+        "map.ply",
+        "bev.png",
+        "poses.tum",
+        "metrics.json",
+        "config.yaml",
+    ]
+    assert not page.all("link")
+    assert not any("src" in script for script in page.all("script"))
+    plotly = max(page.scripts, key=len)
+    assert not re.findall(r"https?://", content.replace(plotly, ""))
+    policy = next(meta["content"] for meta in page.all("meta") if meta.get("http-equiv") == "Content-Security-Policy")
+    assert policy.startswith("default-src 'none'")
+    assert str(made_run.parent) not in content
+
+
+def test_inserted_text_is_escaped(made_run) -> None:
+    page = page_of(made_run)
+    assert page.text.count(NASTY) >= 3
+    assert not any("alert" in script for script in page.scripts)
+
+
+def test_class_names_cannot_leave_the_script(tmp_path) -> None:
+    run = make_run(tmp_path / "run", classes=("sand</script><b>", "rock"))
+    write_report(run)
+    page = page_of(run)
+    figure = json.loads(page.scripts[0])
+    assert "sand</script><b>" in figure["data"][0]["colorbar"]["ticktext"]
+    assert not page.all("b")
+
+
+def test_path_is_drawn_in_the_maps_world(made_run) -> None:
+    figure = json.loads(page_of(made_run).scripts[0])
+    line = next(trace for trace in figure["data"] if trace.get("mode") == "lines")
+    x = np.frombuffer(base64.b64decode(line["x"]["bdata"]), np.dtype(line["x"]["dtype"]))
+    np.testing.assert_allclose(x[[0, -1]], [-3, 6], atol=1e-5)
+
+
+def test_optional_parts_are_left_out(run_folder) -> None:
+    for name in ("bev.png", "config.yaml", "poses.tum", "map.ply"):
+        (run_folder / name).unlink()
+    shutil.rmtree(run_folder / "pictures")
+    (run_folder / "metrics.json").write_text("{}")
+    write_report(run_folder)
+    page = page_of(run_folder)
+    assert not page.all("img")
+    assert "In 3D" in page.text
+    for absent in (
+        "From above",
+        "Key frames",
+        "Skipped frames",
+        "Notes",
+        "Configuration",
+        "frames skipped",
+        "None",
+        "nan",
+    ):
+        assert absent not in page.text
+    assert page.all("title")
+    assert run_folder.name in page.text
+
+
+def test_broken_optional_parts_are_left_out_and_told(run_folder) -> None:
+    (run_folder / "bev.png").write_bytes(b"no picture")
+    (run_folder / "pictures" / "000000_left.png").write_bytes(b"")
+    (run_folder / "poses.tum").write_text("a b c d")
+    write_report(run_folder)
+    page = page_of(run_folder)
+    assert len(page.all("img")) == 5
+    for remark in ("bev.png could not be read", "000000_left.png could not be read", "poses.tum could not be read"):
+        assert remark in page.text
+
+
+def test_metrics_of_other_shapes_are_shown_kindly(run_folder) -> None:
+    metrics = {
+        "sequence": [1, 2],
+        "times": {"total_s": None, "stages": {"match": 3, "step": {"median_ms": float("nan")}}},
+        "voxels": {"by_class": {"moon": "many"}},
+        "memory": "much",
+        "deep": {"one": {"two": True}},
+    }
+    (run_folder / "metrics.json").write_text(json.dumps(metrics))
+    write_report(run_folder)
+    text = page_of(run_folder).text
+    assert {"moon", "One two", "yes"} <= set(text.splitlines())
+
+
+def test_an_interrupted_run_and_many_key_frames(run_folder) -> None:
+    from jaxmap.map_store import load_map
+
+    voxel_map, attributes = load_map(run_folder / "map.zarr")
+    cut = MapAttributes(attributes.crs, SITE, fusion=attributes.fusion, progress={"complete": False, "next_frame": 12})
+    save_map(run_folder / "map.zarr", voxel_map, cut)
+    for frame in range(30):
+        Image.new("RGB", (8, 6)).save(run_folder / "pictures" / f"{frame:06d}_left.png")
+    write_report(run_folder)
+    text = page_of(run_folder).text
+    assert "interrupted (next frame 12)" in text
+    assert text.count("Frame 0000") == MAX_KEY_FRAMES
+    assert f"{MAX_KEY_FRAMES} of 30 key frames." in text
+
+
+def test_an_empty_map_has_no_3d_view(run_folder) -> None:
+    save_map(
+        run_folder / "map.zarr", make_voxel_map(make_grid([0, 0, 0], [1, 1, 1], 0.2), ROVER_CLASSES), MapAttributes()
+    )
+    write_report(run_folder)
+    assert (run_folder / "report.html").stat().st_size < 300_000
+    assert "No voxel is occupied." in page_of(run_folder).text
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda run: (run / "metrics.json").unlink(), "no such file in .*metrics.json"),
+        (lambda run: (run / "metrics.json").write_text("{"), "not readable as JSON"),
+        (lambda run: (run / "metrics.json").write_text("[]"), "not a JSON object"),
+        (lambda run: shutil.rmtree(run / "map.zarr"), "no such map"),
+        (lambda run: shutil.rmtree(run), "no such run folder"),
+    ],
+)
+def test_what_a_report_cannot_do_without(run_folder, break_it, message) -> None:
+    break_it(run_folder)
+    with pytest.raises(JaxmapError, match=message) as caught:
+        write_report(run_folder)
+    assert "\n" not in str(caught.value)
+    assert not (run_folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("fusion", [{"params": {"unknown": 1}}, {"rule": {"unknown": 1}}, {"params": [1]}])
+def test_fusion_that_is_not_understood(run_folder, fusion) -> None:
+    save_map(
+        run_folder / "map.zarr", make_voxel_map(make_grid([0, 0, 0], [1, 1, 1], 0.2), ()), MapAttributes(fusion=fusion)
+    )
+    with pytest.raises(JaxmapError, match="the attribute fusion is not understood"):
+        write_report(run_folder)
+
+
+def test_wording() -> None:
+    assert name_and_unit("peak_resident_mib") == ("Peak resident", "MiB")
+    assert name_and_unit("frames_per_s") == ("Frames per s", "")
+    assert name_and_unit("m") == ("M", "")
+    assert name_and_unit("<b>_m") == ("&lt;b&gt;", "m")
+    assert number_text(0.123456) == "0.1235"
+    assert number_text(5790321.6) == "5\N{NARROW NO-BREAK SPACE}790\N{NARROW NO-BREAK SPACE}321.6"
+    assert number_text(float("inf")) == "–"
+    assert value_text("<a>") == "&lt;a&gt;"
+    assert value_text(None, "m") == "–"
+    assert value_text(False) == "no"
+    assert value_text(-3, "m") == "−3&nbsp;m"
