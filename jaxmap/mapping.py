@@ -153,13 +153,12 @@ def run_plan(
         tell("the run is complete already; its outputs are written anew")
     elif log.next_index:
         tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
-    temporary_bytes = 0
     saved_s = resumed_s = time.perf_counter()
     frames = prepare_frames(plan.sequence, plan.front_end, plan.label_folder, first=log.next_index)
     run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict)
     for voxel_map, fused in run:
         if fused.cost is not None:
-            temporary_bytes = fused.cost.temporary_bytes
+            log.temporary_bytes = fused.cost.temporary_bytes
             log.compile_s += fused.cost.compile_s
             # Compiling is told apart from mapping.
             resumed_s += fused.cost.compile_s
@@ -184,7 +183,7 @@ def run_plan(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
     write_exports(folder, voxel_map, attributes)
-    metrics = _metrics(plan, log, voxel_map, temporary_bytes)
+    metrics = _metrics(plan, log, voxel_map)
     write_json(folder.metrics, metrics)
     write_report(folder.path)
     return metrics
@@ -209,7 +208,7 @@ def _write_key_frame(plan: Plan, folder: RunFolder, prepared: PreparedFrame, num
     write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
 
 
-def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap, temporary_bytes: int) -> dict[str, Any]:
+def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
     """What metrics.json holds."""
     sequence, camera, grid = plan.sequence, plan.front_end.camera, plan.grid
     steps_m = np.linalg.norm(np.diff(sequence.T_world_camera[:, :3, 3], axis=0), axis=1)
@@ -256,7 +255,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap, temporary_bytes: int)
         "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),
         "memory": {
             "map_mib": round(voxel_map.log_odds.nbytes / 2**20, 2),
-            "step_temporary_mib": round(temporary_bytes / 2**20, 2),
+            "step_temporary_mib": round(log.temporary_bytes / 2**20, 2),
             "peak_resident_mib": round(peak_resident_mib(), 1),
         },
     }

@@ -32,6 +32,7 @@ class RunLog:
         points_fused: points that the labeller kept.
         total_s: time spent on frames.
         compile_s: time spent on compiling.
+        temporary_bytes: memory that the step takes beside the map.
         complete: whether the run has come to its end.
     """
 
@@ -43,6 +44,7 @@ class RunLog:
     points_fused: int = 0
     total_s: float = 0.0
     compile_s: float = 0.0
+    temporary_bytes: int = 0
     complete: bool = False
 
     def add(self, fused: FusedFrame) -> None:

@@ -36,7 +36,7 @@ def cameras(draw: st.DrawFn, doffs: bool = True) -> StereoCamera:
         cx_px=draw(st.floats(5, 25)),
         cy_px=draw(st.floats(5, 20)),
         baseline_m=draw(st.floats(0.05, 0.5)),
-        doffs_px=draw(st.floats(-2, 5)) if doffs else 0.0,
+        doffs_px=draw(st.integers(-32, 80)) / 16 if doffs else 0.0,
         width_px=WIDTH_PX,
         height_px=HEIGHT_PX,
     )

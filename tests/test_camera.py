@@ -92,9 +92,7 @@ def test_offset_of_principal_points_moves_zero_disparity_off_infinity():
 
 
 def test_no_gradient_is_nan_where_disparity_means_nothing():
-    camera = make_stereo_camera(
-        fx_px=30, cx_px=15, cy_px=11, baseline_m=0.2, width_px=WIDTH_PX, height_px=HEIGHT_PX
-    )
+    camera = make_stereo_camera(fx_px=30, cx_px=15, cy_px=11, baseline_m=0.2, width_px=WIDTH_PX, height_px=HEIGHT_PX)
     for hole in (np.nan, 0.0, -1.0, np.inf, -np.inf):
         disparity = jnp.full((HEIGHT_PX, WIDTH_PX), hole)
         gradient = jax.grad(lambda *arguments: to_points(*arguments)[0].sum(), argnums=(0, 1))(camera, disparity)
@@ -102,9 +100,7 @@ def test_no_gradient_is_nan_where_disparity_means_nothing():
 
 
 def test_gradients_are_finite_behind_and_on_the_camera_plane():
-    camera = make_stereo_camera(
-        fx_px=30, cx_px=15, cy_px=11, baseline_m=0.2, width_px=WIDTH_PX, height_px=HEIGHT_PX
-    )
+    camera = make_stereo_camera(fx_px=30, cx_px=15, cy_px=11, baseline_m=0.2, width_px=WIDTH_PX, height_px=HEIGHT_PX)
     points = jnp.array([[1.0, 1.0, 0.0], [1.0, 1.0, -2.0], [0.0, 0.0, 3.0]])
     gradient = jax.grad(lambda p: sum(jnp.sum(x) for x in to_pixels(camera, p)[:3]))(points)
     assert np.isfinite(gradient).all()

@@ -17,9 +17,7 @@ from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, PointLabels
 
 PIXELS = HEIGHT_PX * WIDTH_PX
-PLANE = make_plane_labeller(
-    CLASSES, threshold_m=0.1, max_height_m=1.0, hypotheses=64, sample_points=512, sigma_m=0.02
-)
+PLANE = make_plane_labeller(CLASSES, threshold_m=0.1, max_height_m=1.0, hypotheses=64, sample_points=512, sigma_m=0.02)
 HARD = make_files_labeller(CLASSES, soft=False)
 SOFT = make_files_labeller(CLASSES, soft=True)
 

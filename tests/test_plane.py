@@ -14,7 +14,7 @@ from jaxmap.types import Plane
 
 UP = jnp.array([0.0, 0.0, 1.0])
 CLOUD = 256
-OPTIONS = dict(sigma_m=0.03, outlier_range_m=4.0, max_tilt_rad=0.6, hypotheses=64, sample_points=512, em_rounds=3)
+OPTIONS = dict(sigma_m=0.03, outlier_range_m=4.0, max_tilt_rad=0.6, hypotheses=256, sample_points=512, em_rounds=3)
 COSTS = ["mlesac", "msac"]
 
 
@@ -201,4 +201,6 @@ def test_distance_is_signed_metric_and_moves_along(rng, T):
     points = rng.uniform(-3, 3, (64, 3)).astype(np.float32)
     np.testing.assert_allclose(plane_distance(plane, jnp.asarray(points)), points @ normal + 0.7, atol=1e-5)
     stepped = jnp.asarray(points + 0.25 * normal)
-    np.testing.assert_allclose(plane_distance(plane, stepped) - plane_distance(plane, jnp.asarray(points)), 0.25, atol=1e-5)
+    np.testing.assert_allclose(
+        plane_distance(plane, stepped) - plane_distance(plane, jnp.asarray(points)), 0.25, atol=1e-5
+    )

@@ -120,9 +120,7 @@ def test_the_threshold_decides_and_equal_is_not_enough():
 
 
 def test_columns_join_their_voxels_as_the_rule_says():
-    voxel_map = map_of(
-        {(2, 3, 0): [1.0, 0, 2.0, -1.0], (2, 3, 1): [1.0, 0, 0.5, 1.5], (2, 3, 4): [-1.0, 0, 0, 9.0]}
-    )
+    voxel_map = map_of({(2, 3, 0): [1.0, 0, 2.0, -1.0], (2, 3, 1): [1.0, 0, 0.5, 1.5], (2, 3, 4): [-1.0, 0, 0, 9.0]})
     params = make_fusion_params(CLASSES)
     summed = query.top_down(voxel_map, params, FusionRule(column="sum"))
     greatest = query.top_down(voxel_map, params, FusionRule(column="max"))

@@ -54,7 +54,11 @@ def test_a_point_falls_on_one_row_with_the_disparity_of_its_depth(rig, rng):
     for _ in range(8):
         u_px, v_px, disparity_px = int(rng.integers(30, 60)), int(rng.integers(15, 45)), int(rng.integers(2, 15))
         depth_m = float(camera.baseline_m) * float(camera.fx_px) / (disparity_px + float(camera.doffs_px))
-        ray = [(u_px - float(camera.cx_px)) / float(camera.fx_px), (v_px - float(camera.cy_px)) / float(camera.fy_px), 1]
+        ray = [
+            (u_px - float(camera.cx_px)) / float(camera.fx_px),
+            (v_px - float(camera.cy_px)) / float(camera.fy_px),
+            1,
+        ]
         point_left = rectifier.R_rectified_left.T @ (depth_m * np.array(ray))
         point_right = rig.R_right_left @ point_left + rig.t_right_left_m
         at_rest = np.zeros(3)
@@ -93,7 +97,7 @@ def test_labels_take_the_nearest_pixel_and_images_the_bilinear_mean():
     np.testing.assert_array_equal(labels[:, :79], columns[:, 1:])
     assert np.all(labels[:, 79] == 255)
     image = rectify_image((columns * 2).astype(np.uint8), maps)
-    np.testing.assert_allclose(image[:, :78].astype(int), 2 * np.arange(78)[None] + 1.5, atol=0.5001)
+    np.testing.assert_allclose(image[30, :78].astype(int), 2 * np.arange(78) + 1.5, atol=0.5001)
     assert rig.width_px == 80
 
 
@@ -127,7 +131,7 @@ def test_a_wrong_rig_is_refused_in_one_line(wrong, says):
 
 
 def test_cameras_that_are_swapped_or_stacked_are_refused():
-    with pytest.raises(JaxmapError, match="baseline_m is -0.2.*left and right swapped"):
+    with pytest.raises(JaxmapError, match=r"baseline_m is -0.2.*left and right swapped"):
         make_rectifier(make_stereo_rig(**{**RIG, "t_right_left_m": np.array([0.2, 0.0, 0.0])}))
-    with pytest.raises(JaxmapError, match="one above the other.*only horizontal pairs"):
+    with pytest.raises(JaxmapError, match=r"one above the other.*only horizontal pairs"):
         make_rectifier(make_stereo_rig(**{**RIG, "t_right_left_m": np.array([0.0, -0.2, 0.0])}))

@@ -385,4 +385,4 @@ def test_wording() -> None:
     assert value_text("<a>") == "&lt;a&gt;"
     assert value_text(None, "m") == "–"
     assert value_text(False) == "no"
-    assert value_text(-3, "m") == "−3&nbsp;m"
+    assert value_text(-3, "m") == "\N{MINUS SIGN}3&nbsp;m"

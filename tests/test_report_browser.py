@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from test_report import make_run
 
 from jaxmap.labels import ROVER_CLASSES, class_colours
 from jaxmap.report.html import write_report
-from test_report import make_run
 
 pytestmark = pytest.mark.browser
 
@@ -75,13 +75,22 @@ def probed(tmp_path_factory) -> Path:
     return page
 
 
+@pytest.fixture(scope="module")
+def in_light(probed, tmp_path_factory) -> tuple[str, list[str]]:
+    return browse(tmp_path_factory.mktemp("light"), probed, "--dump-dom", "--blink-settings=preferredColorScheme=1")
+
+
+@pytest.fixture(scope="module")
+def in_dark_and_narrow(probed, tmp_path_factory) -> tuple[str, list[str]]:
+    options = ("--dump-dom", "--blink-settings=preferredColorScheme=0")
+    return browse(tmp_path_factory.mktemp("dark"), probed, *options, size=(500, 1400))
+
+
 @pytest.mark.parametrize(
-    ("scheme", "ground", "size"), [(1, "rgb(247, 246, 242)", (1280, 2200)), (0, "rgb(19, 21, 25)", (500, 1400))]
+    ("visit", "ground"), [("in_light", "rgb(247, 246, 242)"), ("in_dark_and_narrow", "rgb(19, 21, 25)")]
 )
-def test_page_loads_draws_and_fetches_nothing(probed, tmp_path, scheme, ground, size) -> None:
-    document, console = browse(
-        tmp_path, probed, "--dump-dom", f"--blink-settings=preferredColorScheme={scheme}", size=size
-    )
+def test_page_loads_draws_and_fetches_nothing(request, visit, ground) -> None:
+    document, console = request.getfixturevalue(visit)
     assert console == []
     state = attributes(document)
     assert state["images"] == "7/7"
@@ -95,9 +104,8 @@ def test_page_loads_draws_and_fetches_nothing(probed, tmp_path, scheme, ground, 
     assert seen["before"]["faces"] > 4000
 
 
-def test_voxels_are_seen_in_their_colours(probed, tmp_path) -> None:
-    document, _ = browse(tmp_path, probed, "--dump-dom")
-    left, top, right, bottom = json.loads(attributes(document)["seen"])["place"]
+def test_voxels_are_seen_in_their_colours(probed, in_light, tmp_path) -> None:
+    left, top, right, bottom = json.loads(attributes(in_light[0])["seen"])["place"]
     picture = tmp_path / "page.png"
     _, console = browse(tmp_path, probed.with_name("report.html"), f"--screenshot={picture}")
     assert console == []

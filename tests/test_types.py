@@ -59,7 +59,9 @@ def test_a_wrong_grid_is_refused(lower, upper, size, says):
 
 def test_a_map_too_large_for_its_indices_is_refused():
     grid = types.make_grid([0, 0, 0], [2000, 2000, 200], 0.5)
-    refused(types.make_voxel_map, grid, CLASSES, says=r"4 channels x 4000 x 4000 x 400 .*larger voxels or a smaller box")
+    refused(
+        types.make_voxel_map, grid, CLASSES, says=r"4 channels x 4000 x 4000 x 400 .*larger voxels or a smaller box"
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,20 @@ from jaxmap.commands.console import Console, parse
 from jaxmap.config import DepthConfig, GridConfig, MapConfig, load_config
 
 SAMPLE = "sample:motorcycle"
+TITLE = "The Motorcycle pair, mapped"
+COLUMNS = {
+    "labeller": "labeller",
+    "preset": "preset",
+    "voxel_size_m": "voxel, m",
+    "median_error_px": "disparity error, px",
+    "bad_2": "bad-2",
+    "valid": "valid",
+    "surface_precision": "surface precision",
+    "surface_recall": "surface recall",
+    "occupied": "occupied voxels",
+    "off_plane": "off the plane",
+    "step_ms": "step, ms",
+}
 
 
 @dataclass(frozen=True)
@@ -63,24 +77,8 @@ def main(words: Sequence[str]) -> int:
         scores = score_motorcycle(plan.sequence, plan.front_end, voxel_map, plan.depth_range_m)
         table.append({"run": name, "labeller": labeller, "preset": preset, **scores, **_figures(metrics)})
     write_json(arguments.out / "table.json", table)
-    write_demo_page(arguments.out, table)
-    console.table(
-        "the Motorcycle pair, mapped",
-        {
-            "labeller": "labeller",
-            "preset": "preset",
-            "voxel_size_m": "voxel [m]",
-            "median_error_px": "disparity error [px]",
-            "bad_2": "bad-2",
-            "valid": "valid",
-            "surface_precision": "surface precision",
-            "surface_recall": "surface recall",
-            "occupied": "occupied voxels",
-            "rock": "off the plane",
-            "step_ms": "step [ms]",
-        },
-        table,
-    )
+    write_demo_page(arguments.out, TITLE, COLUMNS, table)
+    console.table(TITLE, COLUMNS, table)
     console.result(arguments.out, ["report.html", "table.json", *(f"{row['run']}/" for row in table)])
     return 0
 
@@ -91,7 +89,7 @@ def _figures(metrics: dict) -> dict[str, float]:
         "voxel_size_m": metrics["grid"]["voxel_size_m"][0],
         "occupied": metrics["voxels"]["occupied"],
         "free": metrics["voxels"]["free"],
-        "rock": metrics["voxels"]["by_class"].get("rock", 0),
+        "off_plane": metrics["voxels"]["by_class"].get("rock", 0),
         "step_ms": metrics["times"]["stages"]["step"]["median_ms"],
         "match_ms": metrics["times"]["stages"]["match"]["median_ms"],
         "peak_resident_mib": metrics["memory"]["peak_resident_mib"],

@@ -61,7 +61,8 @@ def _encode(
     site_origin: np.ndarray,
     where: object,
 ) -> bytes:
-    import rasterio
+    from rasterio import Affine
+    from rasterio.crs import CRS
     from rasterio.errors import CRSError, NotGeoreferencedWarning
     from rasterio.io import MemoryFile
 
@@ -69,7 +70,7 @@ def _encode(
     east_m, north_m = (_decimal(size) for size in np.asarray(grid.voxel_size_m)[:2])
     west, south = (site_origin[axis] + _decimal(np.asarray(grid.origin_m)[axis]) for axis in (0, 1))
     try:
-        reference = rasterio.crs.CRS.from_user_input(crs) if crs else None
+        reference = CRS.from_user_input(crs) if crs else None
     except CRSError as error:
         raise JaxmapError(
             f"unknown coordinate reference system {crs!r}", where=where, fix='give a name such as "EPSG:32631"'
@@ -82,7 +83,7 @@ def _encode(
         dtype="float32",
         nodata=np.nan,
         crs=reference,
-        transform=rasterio.Affine(east_m, 0.0, west, 0.0, -north_m, south + height * north_m),
+        transform=Affine(east_m, 0.0, west, 0.0, -north_m, south + height * north_m),
         compress="deflate",
         predictor=3,
         interleave="band",

@@ -50,7 +50,7 @@ def _header(vertices: np.ndarray, voxels: OccupiedVoxels, classes: Sequence[str]
         *(f"comment class {index} {' '.join(name.split())}" for index, name in enumerate(classes)),
         f"comment class {IGNORE} without a label",
         f"element vertex {len(vertices)}",
-        *(f"property {_PLY_TYPES[kind.str[1:]]} {name}" for name, (kind, _) in vertices.dtype.fields.items()),
+        *(f"property {_PLY_TYPES[vertices.dtype[name].str[1:]]} {name}" for name in vertices.dtype.names or ()),
         "end_header",
     ]
     return ("\n".join(lines) + "\n").encode("ascii", "backslashreplace")

@@ -20,7 +20,7 @@ class OccupiedVoxels(NamedTuple):
     occupancy where the label is `IGNORE`. Centres are metres in the world, relative to the site's origin.
     """
 
-    index: Int[np.ndarray, "N 3"]
+    index: Int[np.ndarray, "N 3"]  # pyright: ignore[reportIncompatibleMethodOverride]
     centres_world: Float[np.ndarray, "N 3"]
     label: UInt8[np.ndarray, "N"]
     probability: Float[np.ndarray, "N"]

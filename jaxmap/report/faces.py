@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 
 # The corners of a face, for each axis it can be normal to, going round.
 _SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])

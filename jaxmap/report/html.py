@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -14,6 +13,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.files import atomic_path
 from jaxmap.report.inline import inline_image, script_text
+from jaxmap.report.page import page
 from jaxmap.report.run_folder import PICTURE_KINDS, RunFolder, read_run
 from jaxmap.report.tables import group, metric_tables
 from jaxmap.report.voxel_view import voxel_view
@@ -32,8 +32,6 @@ _FILES = {
     "config.yaml": "the configuration",
 }
 _KIND_CAPTIONS = {"left": "Left image", "disparity": "Disparity, near red to far blue", "labels": "Labels"}
-# Whatever a script may try, the browser fetches nothing.
-_POLICY = "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
 def write_report(run: Path) -> Path:
@@ -50,7 +48,7 @@ def write_report(run: Path) -> Path:
     sections = [
         _header(folder, voxels),
         _from_above(folder, remarks),
-        _in_3d(folder, voxels),
+        in_3d(folder, voxels),
         _key_frames(folder, remarks),
         f"<section><h2>Figures</h2>{metric_tables(folder.metrics, folder.voxel_map.classes)}</section>",
         _skipped(folder.metrics),
@@ -58,30 +56,11 @@ def write_report(run: Path) -> Path:
         _configuration(folder),
         _links(folder),
     ]
-    content = _page(_name(folder), "".join(sections), drawn=len(voxels.label) > 0)
+    content = page(_name(folder), "".join(sections), drawn=len(voxels.label) > 0)
     target = folder.path / "report.html"
     with atomic_path(target) as temporary:
         temporary.write_text(content, encoding="utf-8")
     return target
-
-
-def _page(title: str, body: str, *, drawn: bool) -> str:
-    scripts = ""
-    if drawn:
-        from plotly.offline import get_plotlyjs
-
-        scripts = f"<script>{get_plotlyjs()}</script>"
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)} · jaxmap</title>\n<style>{_resource('page.css')}</style>\n</head>\n"
-        f"<body>\n<main>{body}</main>\n{scripts}\n<script>{_resource('page.js')}</script>\n</body>\n</html>\n"
-    )
-
-
-def _resource(name: str) -> str:
-    return files("jaxmap.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def _name(folder: RunFolder) -> str:
@@ -98,10 +77,9 @@ def _header(folder: RunFolder, voxels: OccupiedVoxels) -> str:
     progress = folder.attributes.progress
     banner = ""
     if progress.get("complete") is False:
-        told = ", ".join(
-            f"{str(key).replace('_', ' ')} {value}" for key, value in progress.items() if key != "complete"
-        )
-        banner = f'<p class="banner">This run was interrupted{escape(f" ({told})" if told else "")}: the map is of its first part.</p>'
+        told = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in progress.items() if key != "complete")
+        how_far = escape(f" ({told})" if told else "")
+        banner = f'<p class="banner">This run was interrupted{how_far}: the map is of its first part.</p>'
     stats = "".join(f"<div><dt>{name}</dt><dd>{text}</dd></div>" for name, text in _stats(folder, voxels))
     line = " · ".join(escape(str(fact)) for fact in facts if fact)
     return (
@@ -145,7 +123,8 @@ def _from_above(folder: RunFolder, remarks: list[str]) -> str:
     return f'<section><h2>From above</h2><div class="paper">{image}</div></section>'
 
 
-def _in_3d(folder: RunFolder, voxels: OccupiedVoxels) -> str:
+def in_3d(folder: RunFolder, voxels: OccupiedVoxels) -> str:
+    """The section with the interactive view; a page holds one at most."""
     if not len(voxels.label):
         return "<section><h2>In 3D</h2><p>No voxel is occupied.</p></section>"
     view = voxel_view(voxels, folder.voxel_map.classes, folder.trajectory_world)

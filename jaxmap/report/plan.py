@@ -71,7 +71,7 @@ def top_down_picture(
         np.asarray(top.observed), origin_m, cell_m, path_m, entries, titled=bool(title), by_height=colours.by_height
     )
 
-    figure = Figure(figsize=[px / _DPI for px in layout.figure_px], dpi=_DPI, facecolor="white")
+    figure = Figure(figsize=(layout.figure_px[0] / _DPI, layout.figure_px[1] / _DPI), dpi=_DPI, facecolor="white")
     axes = _map_axes(figure, layout)
     upper_m = origin_m + cell_m * colours.colours.shape[:2]
     axes.imshow(
@@ -170,15 +170,19 @@ def _nice(number: float) -> float:
 def _draw_path(axes: Axes, path_m: np.ndarray) -> None:
     if not len(path_m):
         return
-    line = dict(solid_capstyle="round", solid_joinstyle="round", zorder=4)
+    line: dict[str, Any] = dict(solid_capstyle="round", solid_joinstyle="round", zorder=4)
     axes.plot(*path_m.T, color=_CASING, linewidth=4.2, alpha=0.9, **line)
     axes.plot(*path_m.T, color=_INK, linewidth=1.8, **line)
     for point_m, style in ((path_m[0], _START), (path_m[-1], _END)):
         axes.plot(*point_m, **style, zorder=5)
 
 
-_START = dict(marker="o", markersize=9, markerfacecolor=_CASING, markeredgecolor=_INK, markeredgewidth=1.8)
-_END = dict(marker="s", markersize=8, markerfacecolor=_INK, markeredgecolor=_CASING, markeredgewidth=1.4)
+_START: dict[str, Any] = dict(
+    marker="o", markersize=9, markerfacecolor=_CASING, markeredgecolor=_INK, markeredgewidth=1.8
+)
+_END: dict[str, Any] = dict(
+    marker="s", markersize=8, markerfacecolor=_INK, markeredgecolor=_CASING, markeredgewidth=1.4
+)
 
 
 def _legend_entries(top: TopDown, classes: Sequence[str], colours: Relief, with_path: bool) -> list[tuple[Any, str]]:
@@ -195,7 +199,9 @@ def _legend_entries(top: TopDown, classes: Sequence[str], colours: Relief, with_
     if IGNORE in present and not colours.by_height:
         swatches.append(("no label", class_colours(classes)[IGNORE]))
     swatches.append(("not observed", UNOBSERVED_COLOUR))
-    entries = [(Patch(facecolor=np.array(c) / 255, edgecolor="#00000030", linewidth=0.6), name) for name, c in swatches]
+    entries: list[tuple[Any, str]] = [
+        (Patch(facecolor=tuple(np.array(c) / 255), edgecolor="#00000030", linewidth=0.6), name) for name, c in swatches
+    ]
     if with_path:
         entries.append((Line2D([], [], color=_INK, linewidth=1.8), "path"))
         entries += [(Line2D([], [], linestyle="", **style), name) for style, name in ((_START, "start"), (_END, "end"))]

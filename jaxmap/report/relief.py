@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -52,7 +52,7 @@ def _shade(
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     # Heights of the nearest seen cell keep the rim of the map level; a slight blur hides the steps of the voxels.
-    nearest = distance_transform_edt(~observed, return_distances=False, return_indices=True)
+    nearest: Any = distance_transform_edt(~observed, return_distances=False, return_indices=True)
     smooth_m = gaussian_filter(height_m[tuple(nearest)], 0.7, mode="nearest")
     slopes = [_slope(smooth_m, axis) / cell_size_m[axis] for axis in (0, 1)]
     normal = np.stack([-slopes[0], -slopes[1], np.ones_like(smooth_m)], axis=-1)

@@ -73,9 +73,12 @@ def read_run(run: Path) -> RunFolder:
 def _fusion(voxel_map: VoxelMap, attributes: MapAttributes, where: Path) -> tuple[FusionParams, FusionRule]:
     try:
         params = make_fusion_params(voxel_map.classes, **attributes.fusion.get("params", {}))
-        rule = attributes.fusion.get("rule", {})
         # JSON knows no tuples.
-        return params, FusionRule(**{k: tuple(v) if isinstance(v, list) else v for k, v in rule.items()})
+        rule: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in attributes.fusion.get("rule", {}).items()
+        }
+        return params, FusionRule(**rule)
     except (TypeError, ValueError, AttributeError) as error:
         raise JaxmapError(f"the attribute fusion is not understood ({error})", where=where, fix="map again") from error
 

@@ -88,11 +88,9 @@ def _row(key: str, value: object, prefix: str = "") -> str:
     if isinstance(value, dict):
         return "".join(_row(inner, item, f"{prefix}{key} ") for inner, item in value.items())
     name, unit = name_and_unit(f"{prefix}{key}")
-    if key.endswith("fraction") and isinstance(value, float):
-        text = share_text(value)
-    else:
-        text = value_text(value, unit, key)
-    return f'<tr><th scope="row">{name}</th><td>{text}</td></tr>'
+    if isinstance(value, float) and key.endswith("fraction"):
+        return f'<tr><th scope="row">{name}</th><td>{share_text(value)}</td></tr>'
+    return f'<tr><th scope="row">{name}</th><td>{value_text(value, unit, key)}</td></tr>'
 
 
 def _number(value: object) -> float:

@@ -55,7 +55,7 @@ def share_text(share: float) -> str:
 
 
 def _grouped(digits: str) -> str:
-    return digits.replace(",", _THIN).replace("-", "−")
+    return digits.replace(",", _THIN).replace("-", "\N{MINUS SIGN}")
 
 
 def _sentence(words: list[str]) -> str:

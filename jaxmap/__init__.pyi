@@ -1,0 +1,85 @@
+from .datasets import ReadOptions, StereoSequence, open_sequence
+from .errors import FrameError, JaxmapError, UsageError
+from .fusion.carve import carve
+from .fusion.integrate import integrate
+from .fusion.query import TopDown, class_probabilities, occupancy_probability, top_down, voxel_labels
+from .geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
+from .geometry.grid import voxel_centres, world_to_voxel
+from .geometry.plane import fit_plane_mlesac, plane_distance
+from .labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
+from .labels import IGNORE, ROVER_CLASSES
+from .map_store import MapAttributes, load_map, save_map
+from .mapper import Mapper, MapperParams, make_mapper
+from .sequence import prepare_frames, run_sequence
+from .stereo.front_end import StereoFrontEnd
+from .stereo.options import StereoOptions
+from .stereo.rectify import make_stereo_rig
+from .types import (
+    Frame,
+    FusionParams,
+    FusionRule,
+    GridSpec,
+    Plane,
+    PointLabels,
+    StereoCamera,
+    VoxelMap,
+    make_fusion_params,
+    make_grid,
+    make_stereo_camera,
+    make_voxel_map,
+)
+
+__version__: str
+
+__all__ = [
+    "IGNORE",
+    "ROVER_CLASSES",
+    "Frame",
+    "FrameError",
+    "FusionParams",
+    "FusionRule",
+    "GridSpec",
+    "JaxmapError",
+    "Labeller",
+    "MapAttributes",
+    "Mapper",
+    "MapperParams",
+    "Plane",
+    "PointLabels",
+    "ReadOptions",
+    "StereoCamera",
+    "StereoFrontEnd",
+    "StereoOptions",
+    "StereoSequence",
+    "TopDown",
+    "UsageError",
+    "VoxelMap",
+    "carve",
+    "class_probabilities",
+    "depth_sigma",
+    "disparity_to_points",
+    "fit_plane_mlesac",
+    "integrate",
+    "load_map",
+    "make_files_labeller",
+    "make_fusion_params",
+    "make_grid",
+    "make_mapper",
+    "make_no_labeller",
+    "make_plane_labeller",
+    "make_stereo_camera",
+    "make_stereo_rig",
+    "make_voxel_map",
+    "occupancy_probability",
+    "open_sequence",
+    "plane_distance",
+    "points_to_pixels",
+    "prepare_frames",
+    "run_sequence",
+    "save_map",
+    "top_down",
+    "transform_points",
+    "voxel_centres",
+    "voxel_labels",
+    "world_to_voxel",
+]

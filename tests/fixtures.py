@@ -1,0 +1,105 @@
+"""Fixtures of the command-line tests: one cache folder, one small sequence, one finished run.
+
+Import them by name into a test module. They are made once for the whole session, whoever asks.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from scenes import write_folder_sequence
+
+from jaxmap.cli import main
+
+FRAMES = 6
+
+GRID = ("--grid.lower-m", "-2", "0", "-0.5", "--grid.upper-m", "2", "5.2", "1")
+"""Bounds that hold the scene: every run of the suite has the same shape, so that the step is compiled once."""
+
+
+class Outcome(NamedTuple):
+    """What a command gave back."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def error(self) -> str:
+        """The one error line, without `error: `; it must be there, and be the last line."""
+        lines = [line for line in self.err.splitlines() if line]
+        assert [line for line in lines if line.startswith("error: ")] == lines[-1:], self.err
+        assert "Traceback" not in self.err + self.out, self.err
+        return lines[-1].removeprefix("error: ")
+
+
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Compiled programs are kept here, for this process and those it starts; never in the user's cache."""
+    return _cache_folder(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture(scope="session")
+def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six frames of the scene as a plain folder; only to be read."""
+    return _scene_folder(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory, shared_cache: Path) -> Path:
+    """The run folder of the scene under the defaults; only to be read."""
+    return _finished_run(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def scene_copy(scene_folder: Path, tmp_path: Path) -> Path:
+    """The scene, to be damaged."""
+    return Path(shutil.copytree(scene_folder, tmp_path / "scene"))
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a command in this process."""
+
+    def run(*words: object) -> Outcome:
+        capsys.readouterr()
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as stop:
+            status = stop.code if isinstance(stop.code, int) else 1
+        return Outcome(status, *capsys.readouterr())
+
+    return run
+
+
+def map_words(sequence: object, out: object, *more: object) -> list[str]:
+    """The command line that maps the scene."""
+    return [str(word) for word in ("map", sequence, "--out", out, *GRID, *more)]
+
+
+@cache
+def _cache_folder(base: Path) -> Path:
+    folder = base / "jaxmap_cache"
+    os.environ["JAXMAP_CACHE"] = str(folder)
+    return folder
+
+
+@cache
+def _scene_folder(base: Path) -> Path:
+    return write_folder_sequence(base / "scene", FRAMES)
+
+
+@cache
+def _finished_run(base: Path) -> Path:
+    out = base / "finished_run"
+    assert main(map_words(_scene_folder(base), out)) == 0
+    return out
