@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from fixtures import GRID, Run, cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
+from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from PIL import Image
 from scenes import CAMERA
 
@@ -215,13 +215,15 @@ MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "a config that is a list": (2, with_yaml("- 1\n")),
     "unknown config": (2, with_words("--config", "chiodini2019")),
     "out of range on the command line": (2, with_words("--plane.threshold-m", "-1")),
-    "unknown class": (1, with_words("--plane.off-plane", "boulder")),
+    "unknown class": (2, with_words("--plane.off-plane", "boulder")),
     "nearest depth beyond the farthest": (2, with_words("--depth.min-m", "9")),
-    "odd disparities": (1, with_words("--stereo.num-disparities", "20")),
-    "even block": (1, with_words("--stereo.block-size", "4")),
+    "odd disparities": (2, with_words("--stereo.num-disparities", "20")),
+    "even block": (2, with_words("--stereo.block-size", "4")),
+    "matrix of another size": (2, with_yaml("fusion: {class_increments: [[1, 0], [0, 1]]}\n")),
+    "penalties the wrong way round": (2, with_words("--stereo.p1", "9", "--stereo.p2", "3")),
     "too large a map": (1, with_words("--grid.max-memory-gib", "1e-4")),
     "voxels too small to be counted": (1, with_words("--grid.voxel-size-m", "1e-6")),
-    "bounds the wrong way round": (1, with_words("--grid.lower-m", "3", "0", "0")),
+    "bounds the wrong way round": (2, with_words("--grid.lower-m", "3", "0", "0")),
     "files without a folder": (2, with_words("--labeller", "files")),
     "no such folder of labels": (1, with_words("--labeller", "files", "--labels", "nowhere")),
     "missing label": (1, labels(missing_label)),
@@ -231,6 +233,16 @@ MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "label in colours": (1, labels(colour_label)),
     "probabilities over 1": (1, labels(wild_probabilities)),
 }
+
+
+NAMED = {
+    "one pair of another size": "f003",
+    "left and right of different size": "f000",
+    "label of another size": "f000.png",
+    "missing right image": "f002.png",
+    "NaN pose": "line 4",
+}
+"""What an error must name."""
 
 
 @pytest.fixture(scope="module")
@@ -266,6 +278,7 @@ def test_a_fault_of_map_is_one_line(name, scene_copy, tmp_path, cli, told, monke
     assert "fault of jaxmap" not in outcome.error
     assert len(outcome.error) < 400
     assert ";" in outcome.error, "says what to do"
+    assert NAMED.get(name, "") in outcome.error, "says where"
     assert not (tmp_path / "run" / "metrics.json").exists()
     compare(name, f"{outcome.status} {outcome.error}", tmp_path, told)
 

@@ -247,10 +247,9 @@ def test_any_number_of_classes_goes_through_the_step(classes):
     assert np.asarray(view.observed).any()
 
 
-def test_soft_labels_are_hardened_where_points_count_once():
-    classes, rule = CLASSES, RULES["paper"]
-    soft = make_mapper(CAMERA, GRID, make_files_labeller(classes, soft=True), rule, DEPTH_RANGE_M)
-    hard = files_mapper(rule)
+def test_soft_labels_are_hardened_where_points_count_once(mappers):
+    soft = make_mapper(CAMERA, GRID, make_files_labeller(CLASSES, soft=True), RULES["paper"], DEPTH_RANGE_M)
+    hard = mappers["paper"]
     frame = an_example_frame(2)
     labels = jnp.where(frame.labels == 255, 0, frame.labels)
     hesitant = 0.6 * jax.nn.one_hot(labels, 3) + 0.4 / 3

@@ -35,7 +35,7 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], rows: Seq
     body = "".join(
         [
             f'<header><p class="kind">jaxmap demo</p><h1>{escape(title)}</h1></header>',
-            f"<section><h2>What went in, and its labels</h2>{_key_frame(shown.path)}</section>",
+            f"<section><h2>What went in, and its labels</h2>{key_frame_row(shown.path)}</section>",
             f"<section><h2>The maps from above</h2>{_maps(out, rows)}</section>",
             f"<section><h2>Scores</h2>{_table(columns, rows)}</section>",
             in_3d(shown, voxels),
@@ -51,7 +51,8 @@ def _in_3d_run(runs: Sequence[str]) -> str:
     return "plane" if "plane" in runs else runs[-1]
 
 
-def _key_frame(run: Path) -> str:
+def key_frame_row(run: Path) -> str:
+    """The pictures of a run's first key frame, side by side."""
     captions = {"left": "Left image", "disparity": "Disparity, near red to far blue", "labels": "Labels"}
     figures = ""
     for kind, caption in captions.items():
@@ -71,9 +72,16 @@ def _maps(out: Path, rows: Sequence[Row]) -> str:
 
 
 def _table(columns: Mapping[str, str], rows: Sequence[Row]) -> str:
-    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in columns.values())
-    body = "".join("<tr>" + "".join(f"<td>{value_text(row[key])}</td>" for key in columns) + "</tr>" for row in rows)
+    head = "".join(f'<th scope="col"{_alignment(rows[0][key])}>{escape(name)}</th>' for key, name in columns.items())
+    body = "".join(
+        "<tr>" + "".join(f"<td{_alignment(row[key])}>{value_text(row[key])}</td>" for key in columns) + "</tr>"
+        for row in rows
+    )
     return (
         '<div class="tables"><figure class="wide"><table class="stages">'
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></figure></div>"
     )
+
+
+def _alignment(value: object) -> str:
+    return ' class="text"' if isinstance(value, str) else ""

@@ -1,0 +1,277 @@
+"""Runs that are cut off, gone on with, or refused; an interrupted run must end as if nothing had happened."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
+from test_mapping_run import config_of, log_odds, metrics_of, planned
+
+import jaxmap
+from jaxmap import map_store
+from jaxmap.errors import JaxmapError
+from jaxmap.map_store import load_map
+from jaxmap.mapping import run_plan
+from jaxmap.run_folder import RunFolder
+from jaxmap.sequence import FusedFrame
+
+
+class Cut(Exception):
+    """Stands for whatever ends a run early."""
+
+
+def cut_after(index: int) -> Callable[[FusedFrame], None]:
+    def on_frame(fused: FusedFrame) -> None:
+        if fused.prepared.index == index:
+            raise Cut
+
+    return on_frame
+
+
+def run_until(sequence: Path, out: Path, index: int, checkpoint_every_s: float = 0.0) -> None:
+    """Maps into `out`, saving after each frame, and is cut off after a frame, before that one is saved."""
+    folder = RunFolder(out)
+    folder.begin(str(sequence), config_of(), resume=False, overwrite=False)
+    with pytest.raises(Cut):
+        run_plan(
+            planned(sequence),
+            folder,
+            strict=False,
+            checkpoint_every_s=checkpoint_every_s,
+            tell=lambda line: None,
+            on_frame=cut_after(index),
+        )
+
+
+def same_run(run: Path, whole: Path) -> None:
+    np.testing.assert_array_equal(log_odds(run), log_odds(whole))
+    assert (run / "poses.tum").read_bytes() == (whole / "poses.tum").read_bytes()
+    assert (run / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
+    metrics, expected = metrics_of(run), metrics_of(whole)
+    for part in ("sequence", "camera", "grid", "labeller", "points", "voxels"):
+        assert metrics[part] == expected[part], part
+    progress, expected_progress = (load_map(path / "map.zarr")[1].progress for path in (run, whole))
+    for part in ("next_index", "fused", "skipped", "valid_fractions", "points_fused", "complete"):
+        assert progress[part] == expected_progress[part], part
+    assert all(len(times) == FRAMES for times in progress["stages_ms"].values())
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("index", [0, 1, 4])
+def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, finished_run, tmp_path):
+    run_until(scene_folder, tmp_path / "run", index)
+    saved = load_map(tmp_path / "run" / "map.zarr")[1].progress["next_index"] if index else 0
+    assert saved == index
+    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume"))
+    assert outcome.status == 0
+    assert index == 0 or f"going on after {index} of {FRAMES} frames" in outcome.err
+    same_run(tmp_path / "run", finished_run)
+
+
+def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
+    run_until(scene_folder, tmp_path / "run", 2)
+    folder = RunFolder(tmp_path / "run")
+    folder.begin(str(scene_folder), config_of(), resume=True, overwrite=False)
+    with pytest.raises(Cut):
+        run_plan(
+            planned(scene_folder),
+            folder,
+            strict=False,
+            checkpoint_every_s=0.0,
+            tell=lambda line: None,
+            on_frame=cut_after(4),
+        )
+    assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
+    same_run(tmp_path / "run", finished_run)
+
+
+def test_a_skipped_frame_is_counted_once_over_a_cut(cli, scene_copy, tmp_path):
+    (scene_copy / "right" / "f001.png").unlink()
+    run_until(scene_copy, tmp_path / "run", 3)
+    assert cli(*map_words(scene_copy, tmp_path / "run", "--resume")).status == 0
+    sequence = metrics_of(tmp_path / "run")["sequence"]
+    assert sequence["fused"] == FRAMES - 1
+    assert [skipped["frame"] for skipped in sequence["skipped"]] == ["f001"]
+
+
+def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_path):
+    # The frames are slowed down, so that the process dies in the middle of the run.
+    program = (
+        "import sys, time, jaxmap.sequence, jaxmap.mapping\n"
+        "from jaxmap.cli import main\n"
+        "fuse = jaxmap.sequence.run_sequence\n"
+        "def slowly(*words, **options):\n"
+        "    for result in fuse(*words, **options):\n"
+        "        yield result\n"
+        "        time.sleep(0.5)\n"
+        "jaxmap.mapping.run_sequence = slowly\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    run = tmp_path / "run"
+    words = map_words(scene_folder, run, "--checkpoint-every-s", "0")
+    environment = {**os.environ, "PYTHONPATH": str(Path(jaxmap.__file__).parents[1])}
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *words], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        deadline_s = time.monotonic() + 120
+        while not _saved_frames(run) >= 2:
+            assert process.poll() is None, "the run ended before it could be killed"
+            assert time.monotonic() < deadline_s
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    finally:
+        process.kill()
+        process.wait()
+    assert 2 <= _saved_frames(run) < FRAMES
+    assert not (run / "metrics.json").exists()
+    assert cli(*map_words(scene_folder, run, "--resume")).status == 0
+    same_run(run, finished_run)
+    assert not [path for path in run.iterdir() if path.name.startswith(".")], "no leftovers"
+
+
+def _saved_frames(run: Path) -> int:
+    try:
+        return json.loads((run / "map.zarr" / "zarr.json").read_text())["attributes"]["progress"]["next_index"]
+    except (OSError, ValueError, KeyError):
+        return 0
+
+
+def test_other_settings_are_refused_by_name(cli, scene_folder, tmp_path):
+    run_until(scene_folder, tmp_path / "run", 2)
+    before = contents(tmp_path / "run")
+    for words, name in (
+        (("--fusion.class-hit", "1.1"), "fusion.class_hit"),
+        (("--stride", "2"), "stride"),
+        (("--plane.threshold-m", "0.2"), "plane.threshold_m"),
+    ):
+        outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", *words))
+        assert outcome.status == 2
+        assert name in outcome.error
+    assert contents(tmp_path / "run") == before
+
+
+def test_another_sequence_is_refused(cli, scene_folder, scene_copy, tmp_path):
+    run_until(scene_folder, tmp_path / "run", 2)
+    outcome = cli(*map_words(scene_copy, tmp_path / "run", "--resume"))
+    assert outcome.status == 2
+    assert "sequence" in outcome.error
+
+
+def test_strictness_is_no_other_setting(cli, scene_folder, tmp_path):
+    run_until(scene_folder, tmp_path / "run", 2)
+    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--checkpoint-every-s", "5"))
+    assert outcome.status == 0
+
+
+def test_frames_that_came_since_are_refused(cli, scene_copy, tmp_path):
+    """What was fused so far was bounded and numbered by the frames of then."""
+    rows = (scene_copy / "times.txt").read_text().splitlines()
+    run_until(scene_copy, tmp_path / "run", 4)
+    (scene_copy / "times.txt").write_text("\n".join(rows[1:]))
+    (scene_copy / "left" / "f000.png").unlink()
+    outcome = cli(*map_words(scene_copy, tmp_path / "run", "--resume"))
+    assert outcome.status != 0, "the frames are not those of the run that was begun"
+
+
+def test_a_used_folder_is_left_alone(cli, scene_folder, tmp_path):
+    run_until(scene_folder, tmp_path / "run", 2)
+    before = contents(tmp_path / "run")
+    outcome = cli(*map_words(scene_folder, tmp_path / "run"))
+    assert outcome.status == 1
+    assert all(way in outcome.error for way in ("--resume", "--overwrite", str(tmp_path / "run")))
+    assert contents(tmp_path / "run") == before
+
+
+def test_overwriting_removes_what_an_earlier_run_has_written(cli, scene_folder, tmp_path):
+    run = tmp_path / "run"
+    assert cli(*map_words(scene_folder, run)).status == 0
+    (run / "mine.txt").write_text("not the run's")
+    old = contents(run / "pictures").keys()
+    assert cli(*map_words(scene_folder, run, "--overwrite", "--labeller", "none", "--stop", "1")).status == 0
+    assert metrics_of(run)["sequence"]["fused"] == 1
+    assert log_odds(run).shape[0] == 1
+    assert {path.name for path in (run / "pictures").iterdir()} == {"000000_left.png", "000000_disparity.png"}
+    assert len(old) > 2
+    assert (run / "mine.txt").read_text() == "not the run's"
+
+
+def test_overwriting_and_resuming_exclude_each_other(cli, scene_folder, tmp_path):
+    run_until(scene_folder, tmp_path / "run", 2)
+    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--overwrite"))
+    assert outcome.status == 2, "one of the two is not done"
+
+
+def test_a_complete_run_is_gone_on_with_to_the_same_end(cli, scene_folder, finished_run, tmp_path):
+    run = tmp_path / "run"
+    assert cli(*map_words(scene_folder, run)).status == 0
+    (run / "map.ply").unlink()
+    outcome = cli(*map_words(scene_folder, run, "--resume"))
+    assert outcome.status == 0
+    assert "complete already" in outcome.err
+    same_run(run, finished_run)
+
+
+def test_resuming_in_an_empty_folder_starts(cli, scene_folder, finished_run, tmp_path):
+    (tmp_path / "run").mkdir()
+    assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
+    same_run(tmp_path / "run", finished_run)
+
+
+def test_a_damaged_checkpoint_is_an_error_and_is_kept(cli, scene_folder, tmp_path):
+    run_until(scene_folder, tmp_path / "run", 3)
+    chunk = max((tmp_path / "run" / "map.zarr").rglob("*"), key=lambda path: path.stat().st_size * path.is_file())
+    chunk.write_bytes(chunk.read_bytes()[:-20] + bytes(20))
+    before = contents(tmp_path / "run")
+    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume"))
+    assert outcome.status == 1
+    assert "map.zarr" in outcome.error
+    assert contents(tmp_path / "run") == before
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(cli, scene_folder, finished_run, tmp_path, monkeypatch):
+    write, saves = map_store._write_group, []
+
+    def write_twice(folder: Path, *content: object) -> None:
+        saves.append(folder)
+        write(folder, *content)
+        if len(saves) > 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(map_store, "_write_group", write_twice)
+        outcome = cli(*map_words(scene_folder, tmp_path / "run", "--checkpoint-every-s", "0"))
+    assert outcome.status == 1
+    assert "disk full" in outcome.error
+    assert "map.zarr" in outcome.error
+    assert load_map(tmp_path / "run" / "map.zarr")[1].progress["next_index"] == 2
+    assert not (tmp_path / "run" / "metrics.json").exists()
+    assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
+    same_run(tmp_path / "run", finished_run)
+
+
+@pytest.mark.parametrize("writer", ["write_exports", "write_report", "write_poses"])
+def test_a_full_disk_at_the_end_leaves_a_map_to_resume(writer, cli, scene_folder, finished_run, tmp_path, monkeypatch):
+    import jaxmap.mapping
+
+    def full(*_: object, **__: object) -> None:
+        raise JaxmapError("disk full", where="bev.tif", fix="free some space or write to another disk")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(jaxmap.mapping, writer, full)
+        assert cli(*map_words(scene_folder, tmp_path / "run")).status == 1
+    assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
+    same_run(tmp_path / "run", finished_run)
