@@ -2,6 +2,7 @@ from .datasets import ReadOptions, StereoSequence, open_sequence
 from .errors import FrameError, JaxmapError, UsageError
 from .fusion.carve import carve
 from .fusion.integrate import integrate
+from .fusion.params import FusionParams, FusionRule, make_fusion_params
 from .fusion.query import TopDown, class_probabilities, occupancy_probability, top_down, voxel_labels
 from .geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
 from .geometry.grid import voxel_centres, world_to_voxel
@@ -16,14 +17,11 @@ from .stereo.options import StereoOptions
 from .stereo.rectify import make_stereo_rig
 from .types import (
     Frame,
-    FusionParams,
-    FusionRule,
     GridSpec,
     Plane,
     PointLabels,
     StereoCamera,
     VoxelMap,
-    make_fusion_params,
     make_grid,
     make_stereo_camera,
     make_voxel_map,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
@@ -73,6 +74,9 @@ def make_plane_labeller(
             where="plane labeller",
             fix="take 0 < threshold_m < max_height_m",
         )
+    unknown = fit.keys() - inspect.signature(fit_plane_mlesac).parameters.keys()
+    if unknown:
+        raise JaxmapError(f"fit_plane_mlesac has no option {', '.join(sorted(unknown))}", where="plane labeller")
     sand, rock = classes.index(on_plane), classes.index(off_plane)
 
     def label(frame: Frame, points_world: Array, valid: Array, key: Array) -> tuple[PointLabels, Plane]:

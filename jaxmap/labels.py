@@ -1,8 +1,8 @@
-"""Class names, their colours, and the integer codes of label images."""
+"""Class names and their colours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -39,18 +39,3 @@ def _hue_colour(index: int) -> tuple[int, int, int]:
     hue = (0.11 + index * 0.618034) % 1.0
     red, green, blue = colorsys.hsv_to_rgb(hue, 0.62, 0.82)
     return round(red * 255), round(green * 255), round(blue * 255)
-
-
-def remap_table(remap: Mapping[int, int]) -> np.ndarray:
-    """A lookup table that turns codes of a label image into class indices.
-
-    Args:
-        remap: class index by code; codes that are not named become `IGNORE`.
-
-    Returns:
-        uint8 (256,).
-    """
-    table = np.full(256, IGNORE, np.uint8)
-    for code, label in remap.items():
-        table[code] = label
-    return table

@@ -14,22 +14,13 @@ from jaxtyping import Array, Int, PRNGKeyArray, UInt8
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
+from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.fusion.sensor_model import range_weight
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers import Labeller, harden
 from jaxmap.labels import IGNORE
-from jaxmap.types import (
-    Frame,
-    FusionParams,
-    FusionRule,
-    GridSpec,
-    Plane,
-    PointLabels,
-    StereoCamera,
-    VoxelMap,
-    make_voxel_map,
-)
+from jaxmap.types import Frame, GridSpec, Plane, PointLabels, StereoCamera, VoxelMap, make_voxel_map
 
 
 @jax.tree_util.register_dataclass
@@ -104,7 +95,7 @@ def make_mapper(
         JaxmapError: a depth range that is none.
     """
     min_depth_m, max_depth_m = depth_range_m
-    if not 0 <= min_depth_m < max_depth_m:
+    if not 0 <= min_depth_m < max_depth_m < float("inf"):
         raise JaxmapError(f"depth range {min_depth_m} to {max_depth_m} m", where="mapper", fix="take 0 <= min < max")
     window_size = window_shape(grid, camera, max_depth_m)
 
@@ -113,6 +104,10 @@ def make_mapper(
 
     def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
         """The labelled points of a frame; `key` is the frame's own."""
+        if labeller.needs is not None and getattr(frame, labeller.needs) is None:
+            raise JaxmapError(
+                f"the frame has no {labeller.needs}", where=f"{labeller.name} labeller", fix="fill that field of Frame"
+            )
         points_camera, valid = disparity_to_points(params.camera, frame.disparity_px)
         depth_m = points_camera[..., 2]
         in_range = valid & (depth_m >= min_depth_m) & (depth_m <= max_depth_m)
@@ -128,7 +123,7 @@ def make_mapper(
         labels = harden(seen.labels) if rule.per_frame == "once" else seen.labels
 
         window = view_window(voxel_map.grid, params.camera, frame.T_world_camera, max_depth_m, window_size)
-        weights = jnp.ones(depth_m.size, jnp.float32)
+        weights = jnp.ones(depth_m.size, depth_m.dtype)
         if rule.range_weighting:
             weights = range_weight(params.camera, window.grid, depth_m.reshape(-1), params.fusion)
         free = None

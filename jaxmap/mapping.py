@@ -16,6 +16,7 @@ from jaxmap.config import MapConfig, split_fusion
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
 from jaxmap.map_store import MapAttributes, save_map
@@ -25,7 +26,7 @@ from jaxmap.run_folder import RunFolder, RunLog, peak_resident_mib, write_json
 from jaxmap.run_outputs import count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.types import FusionRule, GridSpec, VoxelMap, make_fusion_params, make_grid
+from jaxmap.types import GridSpec, VoxelMap, make_grid
 
 Tell = Callable[[str], None]
 

@@ -15,12 +15,13 @@ from jaxmap.export.geotiff import write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
 from jaxmap.files import atomic_path
+from jaxmap.fusion.params import FusionParams, FusionRule, make_fusion_params
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
 from jaxmap.map_store import MapAttributes
 from jaxmap.report.pictures import colourise_disparity, overlay_labels, top_down_picture
 from jaxmap.run_folder import RunFolder
 from jaxmap.stereo.front_end import RectifiedFrame
-from jaxmap.types import FusionParams, FusionRule, VoxelMap, make_fusion_params
+from jaxmap.types import VoxelMap
 
 
 def stored_fusion(attributes: MapAttributes, classes: tuple[str, ...]) -> tuple[FusionParams, FusionRule]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,9 +113,12 @@ def make_grid(lower_m: Sequence[float], upper_m: Sequence[float], voxel_size_m: 
         JaxmapError: bounds not finite or not ordered, or a voxel size that is not positive.
     """
     lower, upper = np.asarray(lower_m, np.float64), np.asarray(upper_m, np.float64)
-    size = np.broadcast_to(np.asarray(voxel_size_m, np.float64), (3,))
+    size = np.asarray(voxel_size_m, np.float64)
     if lower.shape != (3,) or upper.shape != (3,):
         raise JaxmapError("a grid takes three lower and three upper bounds", where="grid bounds")
+    if size.shape not in ((), (3,)):
+        raise JaxmapError(f"voxel size {size.tolist()}", where="grid", fix="give one edge in metres, or three")
+    size = np.broadcast_to(size, (3,))
     if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (upper > lower).all()):
         raise JaxmapError(
             f"lower {lower.tolist()} and upper {upper.tolist()} do not span a box",
@@ -125,7 +128,9 @@ def make_grid(lower_m: Sequence[float], upper_m: Sequence[float], voxel_size_m: 
     if not (np.isfinite(size).all() and (size > 0).all()):
         raise JaxmapError(f"voxel size {size.tolist()} m", where="grid", fix="give a positive size")
     # A span of 40 m in voxels of 0.2 m is 200 voxels, not 201, in spite of rounding.
-    counts = np.ceil((upper - lower) / size - 1e-6).astype(int).clip(min=1)
+    counts = np.ceil((upper - lower) / size - 1e-6).clip(min=1)
+    if counts.max() > MAX_TENSOR_ELEMENTS:
+        raise JaxmapError(f"{counts.max():.3g} voxels along one axis", where="grid", fix="take larger voxels")
     return GridSpec(
         origin_m=jnp.asarray(lower, jnp.float32),
         voxel_size_m=jnp.asarray(size, jnp.float32),
@@ -191,120 +196,3 @@ class PointLabels(NamedTuple):
     keep: Bool[Array, "N"]
     labels: Int[Array, "N"] | None = None
     probabilities: Float[Array, "N C"] | None = None
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class FusionParams:
-    """The numbers of the sensor model and of the decision; every leaf is differentiable.
-
-    Log-odds are natural. `class_increments[i, j]` is what one observation of label `i` adds to
-    class `j`. `disparity_sigma_px` drives the range weight and the margin of free-space carving.
-    """
-
-    occupancy_hit: Float[Array, ""]
-    occupancy_miss: Float[Array, ""]
-    occupancy_prior: Float[Array, ""]
-    class_increments: Float[Array, "C C"]
-    class_prior: Float[Array, "C"]
-    disparity_sigma_px: Float[Array, ""]
-    full_evidence_points: Float[Array, ""]
-    occupancy_threshold: Float[Array, ""]
-    class_threshold: Float[Array, ""]
-
-
-@dataclass(frozen=True)
-class FusionRule:
-    """The discrete choices of fusion, fixed when the step is compiled.
-
-    Attributes:
-        per_frame: how the points of one frame in one voxel count. `sum`: each adds its increment;
-            `once`: each label present adds its increment once (the paper); `mean`: the frame adds
-            one increment, shared by the labels' fractions, in full from `full_evidence_points` on.
-        carve: whether voxels seen through are marked free.
-        range_weighting: whether a point counts less as its depth noise outgrows the voxel.
-        priority_classes: classes that win a voxel as soon as their probability passes the
-            threshold, in this order; the others compete by probability.
-        column: how voxels of a column make the top-down map: the `max` probability over them, or
-            the `sum` of their evidence.
-    """
-
-    per_frame: Literal["sum", "once", "mean"] = "mean"
-    carve: bool = True
-    range_weighting: bool = True
-    priority_classes: tuple[str, ...] = ("rock",)
-    column: Literal["max", "sum"] = "sum"
-
-
-def logit(probability: float) -> float:
-    """Natural log-odds of a probability in (0, 1)."""
-    return float(np.log(probability / (1.0 - probability)))
-
-
-def make_fusion_params(
-    classes: Sequence[str],
-    *,
-    occupancy_hit: float = 0.85,
-    occupancy_miss: float = -0.4,
-    occupancy_prior: float = 0.5,
-    class_hit: float = 0.9,
-    class_miss: float = -0.9,
-    class_increments: Sequence[Sequence[float]] | None = None,
-    class_prior: float | Sequence[float] = 0.5,
-    disparity_sigma_px: float = 0.5,
-    full_evidence_points: float = 8.0,
-    occupancy_threshold: float = 0.5,
-    class_threshold: float = 0.5,
-) -> FusionParams:
-    """Checks and builds `FusionParams`; priors and thresholds are probabilities here.
-
-    Without `class_increments`, an observation adds `class_hit` to its own class and `class_miss` to
-    every other (the label confusion of a sensor that treats all classes alike).
-
-    Raises:
-        JaxmapError: a probability outside (0, 1), a matrix of another size, or a wrong sign.
-    """
-    count = len(classes)
-    for name, value in dict(
-        occupancy_prior=occupancy_prior, occupancy_threshold=occupancy_threshold, class_threshold=class_threshold
-    ).items():
-        if not 0.0 < value < 1.0:
-            raise JaxmapError(f"{name} is {value}", where="fusion", fix="give a probability between 0 and 1")
-    if occupancy_hit < 0 or occupancy_miss > 0:
-        raise JaxmapError(
-            f"occupancy_hit {occupancy_hit} and occupancy_miss {occupancy_miss}",
-            where="fusion",
-            fix="a hit adds (>= 0) and a miss takes away (<= 0)",
-        )
-    if disparity_sigma_px <= 0 or full_evidence_points <= 0:
-        raise JaxmapError(
-            "disparity_sigma_px and full_evidence_points must be positive", where="fusion", fix="give numbers above 0"
-        )
-    if class_increments is None:
-        matrix = np.full((count, count), class_miss) + np.eye(count) * (class_hit - class_miss)
-    else:
-        matrix = np.asarray(class_increments, np.float64).reshape(-1, count) if count else np.zeros((0, 0))
-    if matrix.shape != (count, count) or not np.isfinite(matrix).all():
-        raise JaxmapError(
-            f"class_increments is not a finite {count}x{count} matrix",
-            where="fusion",
-            fix=f"one row per class of {list(classes)}",
-        )
-    priors = np.broadcast_to(np.asarray(class_prior, np.float64), (count,))
-    if not ((priors > 0) & (priors < 1)).all():
-        raise JaxmapError(f"class_prior is {class_prior}", where="fusion", fix="give probabilities between 0 and 1")
-
-    def leaf(value: object) -> Array:
-        return jnp.asarray(value, jnp.float32)
-
-    return FusionParams(
-        occupancy_hit=leaf(occupancy_hit),
-        occupancy_miss=leaf(occupancy_miss),
-        occupancy_prior=leaf(logit(occupancy_prior)),
-        class_increments=leaf(matrix),
-        class_prior=leaf(np.log(priors / (1 - priors))),
-        disparity_sigma_px=leaf(disparity_sigma_px),
-        full_evidence_points=leaf(full_evidence_points),
-        occupancy_threshold=leaf(occupancy_threshold),
-        class_threshold=leaf(class_threshold),
-    )

@@ -30,6 +30,7 @@ from PIL import Image
 from jaxmap.datasets import open_sequence
 from jaxmap.datasets.pose_files import write_tum
 from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.labellers import Labeller, make_no_labeller, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapper import Mapper, MapperParams, compile_step, make_mapper
@@ -37,7 +38,7 @@ from jaxmap.run_folder import peak_resident_mib, write_json
 from jaxmap.sequence import prepare_frames, run_sequence
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions
-from jaxmap.types import Frame, FusionRule, StereoCamera, make_fusion_params, make_grid, make_stereo_camera
+from jaxmap.types import Frame, StereoCamera, make_grid, make_stereo_camera
 
 BASELINE = Path(__file__).with_name("bench_baseline.json")
 WIDTH_PX, HEIGHT_PX, DISPARITIES = 1024, 768, 128

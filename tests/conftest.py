@@ -9,8 +9,9 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-# `jaxmap.types` stays out: JAX rebuilds its dataclasses with stacked arrays and placeholders for leaves.
-CHECKED_MODULES = ("fusion", "geometry", "labellers", "labels", "mapper", "stereo")
+# `types` and `fusion.params` stay out: JAX rebuilds dataclasses with stacked arrays and placeholders for leaves.
+FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model")
+CHECKED_MODULES = (*FUSION_MODULES, "geometry", "labellers", "labels", "mapper", "stereo")
 # A float annotation takes an int, as PEP 484 has it.
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 install_import_hook([f"jaxmap.{name}" for name in CHECKED_MODULES], CHECKER)

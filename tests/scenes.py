@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import yaml
 from PIL import Image
@@ -149,10 +148,17 @@ def _pinhole_rays(u_px: np.ndarray, v_px: np.ndarray) -> np.ndarray:
 
 
 def _distorted_rays(K: np.ndarray, distortion: np.ndarray, u_px: np.ndarray, v_px: np.ndarray) -> np.ndarray:
-    pixels = np.stack([u_px, v_px], axis=-1).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-    flat = cv2.undistortPointsIter(pixels, K, distortion, None, None, criteria).reshape(*u_px.shape, 2)
-    return np.concatenate([flat, np.ones((*u_px.shape, 1))], axis=-1)
+    """Rays of a lens with distortion k1 k2 p1 p2, by fixed-point iteration."""
+    k1, k2, p1, p2 = distortion[:4]
+    x_seen, y_seen = (u_px - K[0, 2]) / K[0, 0], (v_px - K[1, 2]) / K[1, 1]
+    x, y = x_seen, y_seen
+    for _ in range(30):
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        x, y = (x_seen - dx) / radial, (y_seen - dy) / radial
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
 def _truth(rays, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from strategies import HEIGHT_PX, WIDTH_PX, cameras, poses, rngs
 
 from jaxmap.fusion import carve as kernels
-from jaxmap.types import GridSpec, make_fusion_params, make_grid, make_stereo_camera
+from jaxmap.fusion.params import make_fusion_params
+from jaxmap.types import GridSpec, make_grid, make_stereo_camera
 
 see_through = jax.jit(kernels.carve, static_argnames="depth_range_m")
 CAMERA = make_stereo_camera(fx_px=30, cx_px=15.5, cy_px=11.5, baseline_m=0.2, width_px=WIDTH_PX, height_px=HEIGHT_PX)

@@ -15,10 +15,11 @@ from jaxmap.errors import JaxmapError
 from jaxmap.export.geotiff import write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import TopDown, class_probabilities, occupancy_probability, occupied, top_down, voxel_labels
 from jaxmap.geometry.grid import voxel_centres, world_to_voxel
 from jaxmap.labels import IGNORE, ROVER_CLASSES, class_colours
-from jaxmap.types import FusionRule, GridSpec, VoxelMap, make_fusion_params
+from jaxmap.types import GridSpec, VoxelMap
 
 UTM_SITE = np.array([588123.456789, 5790321.654321, 12.5])
 

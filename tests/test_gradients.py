@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, disparities
 
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import class_probabilities, top_down
 from jaxmap.labellers import make_files_labeller, make_plane_labeller
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
-from jaxmap.types import Frame, FusionRule, VoxelMap, make_fusion_params, make_grid, make_stereo_camera
+from jaxmap.types import Frame, VoxelMap, make_grid, make_stereo_camera
 
 CAMERA = make_stereo_camera(
     fx_px=30, fy_px=28, cx_px=15.2, cy_px=11.7, baseline_m=0.3, doffs_px=0.4, width_px=WIDTH_PX, height_px=HEIGHT_PX

@@ -25,15 +25,9 @@ from strategies import (
 )
 
 from jaxmap.fusion import integrate as kernels
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.grid import Window, view_window, window_shape
-from jaxmap.types import (
-    FusionRule,
-    PointLabels,
-    make_fusion_params,
-    make_grid,
-    make_stereo_camera,
-    make_voxel_map,
-)
+from jaxmap.types import PointLabels, make_grid, make_stereo_camera, make_voxel_map
 
 fuse = jax.jit(kernels.integrate, static_argnames="rule")
 count = jax.jit(kernels.count_points, static_argnames="class_count")

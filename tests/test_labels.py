@@ -2,23 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from jaxmap.labels import IGNORE, ROVER_CLASSES, UNLABELLED_COLOUR, class_colours, remap_table
+from jaxmap.labels import IGNORE, ROVER_CLASSES, UNLABELLED_COLOUR, class_colours
 
 
 def test_rover_classes_are_in_the_order_of_the_label_images():
     assert ROVER_CLASSES == ("background", "sand", "rock")
     assert IGNORE == 255
-
-
-@given(st.dictionaries(st.integers(0, 255), st.integers(0, 254)))
-def test_a_remap_names_its_codes_and_ignores_the_rest(remap):
-    table = remap_table(remap)
-    assert table.shape == (256,)
-    assert table.dtype == np.uint8
-    assert all(table[code] == remap.get(code, IGNORE) for code in range(256))
 
 
 @pytest.mark.parametrize("count", [0, 3, 21])

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, disparities, poses, rngs
 
 from jaxmap.errors import JaxmapError
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import top_down
 from jaxmap.labellers import make_files_labeller, make_no_labeller, make_plane_labeller
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
-from jaxmap.types import Frame, FusionRule, PointLabels, make_fusion_params, make_grid, make_stereo_camera
+from jaxmap.types import Frame, PointLabels, make_grid, make_stereo_camera
 
 CAMERA = make_stereo_camera(
     fx_px=30, fy_px=28, cx_px=15.2, cy_px=11.7, baseline_m=0.3, doffs_px=0.4, width_px=WIDTH_PX, height_px=HEIGHT_PX
@@ -280,10 +281,10 @@ def test_a_depth_range_that_is_none_is_refused(limits):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("rule", [FusionRule("median"), FusionRule(column="mean")])
-def test_a_rule_that_does_not_exist_is_refused(rule):
+@pytest.mark.parametrize("choice", [{"per_frame": "median"}, {"column": "mean"}])
+def test_a_rule_that_does_not_exist_is_refused(choice):
     with pytest.raises(JaxmapError, match=r"median|mean"):
-        make_mapper(CAMERA, GRID, make_no_labeller(), rule, DEPTH_RANGE_M)
+        FusionRule(**choice)
 
 
 def test_a_frame_that_lacks_what_the_labeller_needs_is_refused(mappers):

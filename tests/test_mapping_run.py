@@ -228,7 +228,9 @@ def test_georeferenced_poses_come_out_absolute(finished_run, tmp_path):
     assert ply["x"].dtype == np.float64
     points = np.stack([ply["x"], ply["y"], ply["z"]], axis=1)
     assert abs(len(points) - len(near_run.label)) < 0.01 * len(points)
-    np.testing.assert_allclose(np.median(points, axis=0) - offset_m, np.median(near_run.centres_world, axis=0), atol=0.051)
+    np.testing.assert_allclose(
+        np.median(points, axis=0) - offset_m, np.median(near_run.centres_world, axis=0), atol=0.051
+    )
     with rasterio.open(tmp_path / "run" / "bev.tif") as raster:
         np.testing.assert_allclose((raster.transform[2], raster.transform[5]), (458072.0, 5429385.2), atol=1e-3)
     track = read_poses(tmp_path / "run" / "poses.tum")

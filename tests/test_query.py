@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from strategies import CLASSES, GRID_SHAPE, grids, random_map, rngs
 
 from jaxmap.fusion import query
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.labels import IGNORE
-from jaxmap.types import FusionRule, make_fusion_params, make_grid, make_voxel_map
+from jaxmap.types import make_grid, make_voxel_map
 
 PAPER = make_fusion_params(
     CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_hit=0.9, class_miss=0.0, class_threshold=0.7

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from strategies import CLASSES, GRID_SHAPE, cameras, grids, rngs
 
 from jaxmap.fusion import sensor_model
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.camera import depth_at_sigma
-from jaxmap.types import FusionRule, make_fusion_params
 
 weight_of = jax.jit(sensor_model.range_weight)
 evidence_of = jax.jit(sensor_model.frame_evidence, static_argnames="rule")

@@ -12,6 +12,7 @@ from strategies import CLASSES, cameras, grids
 
 from jaxmap import types
 from jaxmap.errors import JaxmapError
+from jaxmap.fusion.params import logit, make_fusion_params
 
 CAMERA = dict(fx_px=100.0, cx_px=10.0, cy_px=10.0, baseline_m=0.2, width_px=20, height_px=20)
 NAN, INF = float("nan"), float("inf")
@@ -88,28 +89,28 @@ def test_a_map_too_large_for_its_indices_is_refused():
     ],
 )
 def test_wrong_fusion_parameters_are_refused(wrong, says):
-    refused(types.make_fusion_params, CLASSES, **wrong, says=says)
+    refused(make_fusion_params, CLASSES, **wrong, says=says)
 
 
 def test_increments_are_hit_on_the_diagonal_and_miss_beside_it():
-    params = types.make_fusion_params(CLASSES, class_hit=1.5, class_miss=-0.5)
+    params = make_fusion_params(CLASSES, class_hit=1.5, class_miss=-0.5)
     np.testing.assert_array_equal(params.class_increments, np.full((3, 3), -0.5) + 2 * np.eye(3))
-    named = types.make_fusion_params(CLASSES, class_increments=np.arange(9.0).reshape(3, 3))
+    named = make_fusion_params(CLASSES, class_increments=np.arange(9.0).reshape(3, 3))
     np.testing.assert_array_equal(named.class_increments, np.arange(9).reshape(3, 3))
 
 
 @given(st.floats(0.01, 0.99))
 def test_priors_become_log_odds(probability):
-    params = types.make_fusion_params(CLASSES, occupancy_prior=probability, class_prior=probability)
+    params = make_fusion_params(CLASSES, occupancy_prior=probability, class_prior=probability)
     np.testing.assert_allclose(jax.nn.sigmoid(params.occupancy_prior), probability, rtol=1e-4)
     np.testing.assert_allclose(jax.nn.sigmoid(params.class_prior), np.full(3, probability), rtol=1e-4)
-    np.testing.assert_allclose(1 / (1 + np.exp(-types.logit(probability))), probability)
+    np.testing.assert_allclose(1 / (1 + np.exp(-logit(probability))), probability)
 
 
 @pytest.mark.parametrize("classes", [(), CLASSES, tuple(f"class {n}" for n in range(21))], ids=len)
 def test_maps_and_parameters_fit_any_number_of_classes(classes):
     voxel_map = types.make_voxel_map(types.make_grid([0, 0, 0], [1, 2, 3], 0.5), list(classes))
-    params = types.make_fusion_params(classes)
+    params = make_fusion_params(classes)
     assert voxel_map.log_odds.shape == (1 + len(classes), 2, 4, 6)
     assert not np.asarray(voxel_map.log_odds).any()
     assert voxel_map.classes == classes
@@ -119,7 +120,7 @@ def test_maps_and_parameters_fit_any_number_of_classes(classes):
 
 @given(cameras(), grids())
 def test_values_survive_flattening_and_hold_float32_leaves(camera, grid):
-    for value in (camera, grid, types.make_voxel_map(grid, CLASSES), types.make_fusion_params(CLASSES)):
+    for value in (camera, grid, types.make_voxel_map(grid, CLASSES), make_fusion_params(CLASSES)):
         leaves, structure = jax.tree.flatten(value)
         assert all(leaf.dtype in (jnp.float32, jnp.int32) for leaf in leaves)
         rebuilt = jax.tree.unflatten(structure, leaves)

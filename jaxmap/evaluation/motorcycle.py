@@ -10,11 +10,12 @@ import numpy as np
 from jaxmap.datasets.base import StereoSequence
 from jaxmap.datasets.samples import motorcycle_disparity
 from jaxmap.evaluation.geometry_scores import score_disparity, score_surface
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import occupied
 from jaxmap.labellers import make_no_labeller
 from jaxmap.mapper import MapperParams, make_mapper
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.types import Frame, FusionRule, VoxelMap, make_fusion_params
+from jaxmap.types import Frame, VoxelMap
 
 
 def score_motorcycle(

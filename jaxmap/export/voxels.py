@@ -8,9 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.fusion.query import occupied, voxel_labels
 from jaxmap.labels import IGNORE
-from jaxmap.types import FusionParams, FusionRule, VoxelMap
+from jaxmap.types import VoxelMap
 
 
 class OccupiedVoxels(NamedTuple):

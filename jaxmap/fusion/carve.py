@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from jaxmap.fusion.params import FusionParams
 from jaxmap.geometry.camera import depth_sigma, points_to_pixels, transform_points
 from jaxmap.geometry.grid import voxel_centres
-from jaxmap.types import FusionParams, GridSpec, StereoCamera
+from jaxmap.types import GridSpec, StereoCamera
 
 _MARGIN_SIGMAS = 2.0
 

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.fusion.sensor_model import frame_evidence, total_weight
 from jaxmap.geometry.grid import Window, flat_voxel_index, whole_window
-from jaxmap.types import FusionParams, FusionRule, GridSpec, PointLabels, VoxelMap
+from jaxmap.types import GridSpec, PointLabels, VoxelMap
 
 
 def integrate(
@@ -45,7 +46,7 @@ def integrate(
     """
     if window is None:
         window = whole_window(voxel_map.grid)
-    counts = count_points(window.grid, points_world, labels, weights, len(voxel_map.classes))
+    counts = count_points(voxel_map.grid, points_world, labels, weights, len(voxel_map.classes), window)
     # Kept apart: fused into the update of the map, XLA would compute carving anew for every channel.
     counts, free = jax.lax.optimization_barrier((counts, free))
     evidence = frame_evidence(counts, free, params, rule)
@@ -63,6 +64,7 @@ def count_points(
     labels: PointLabels,
     weights: Float[Array, "N"],
     class_count: int,
+    window: Window | None = None,
 ) -> Float[Array, "C1 X Y Z"]:
     """Weighted number of points per label and voxel, by scatter-add.
 
@@ -71,9 +73,13 @@ def count_points(
         weight of the points in each voxel.
     """
     with jax.named_scope("count_points"):
-        voxel = flat_voxel_index(grid, points_world, labels.keep & jnp.isfinite(weights))
-        rows, voxels = class_count + 1, int(np.prod(grid.shape))
-        counts = jnp.zeros((rows, voxels), jnp.float32)
+        keep = labels.keep & jnp.isfinite(weights)
+        if labels.probabilities is not None:
+            keep &= jnp.isfinite(labels.probabilities).all(axis=-1)
+        voxel = flat_voxel_index(grid, points_world, keep, window)
+        shape = grid.shape if window is None else window.grid.shape
+        rows, voxels = class_count + 1, int(np.prod(shape))
+        counts = jnp.zeros((rows, voxels), weights.dtype)
         if labels.probabilities is not None:
             # Unrolled over channels: one flat scatter each is thrice as fast as scattering rows.
             known = labels.probabilities
@@ -86,4 +92,4 @@ def count_points(
             row = jnp.where((label >= 0) & (label < class_count), label, class_count)
             index = jnp.where(voxel < voxels, row * voxels + voxel, rows * voxels)
             counts = counts.reshape(-1).at[index].add(weights, mode="drop")
-        return counts.reshape(rows, *grid.shape)
+        return counts.reshape(rows, *shape)

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
+from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.geometry.grid import voxel_centres
 from jaxmap.labels import IGNORE
-from jaxmap.types import FusionParams, FusionRule, VoxelMap
+from jaxmap.types import VoxelMap
 
 
 class TopDown(NamedTuple):
@@ -95,8 +96,9 @@ def _decide(
     priority = [classes.index(name) for name in rule.priority_classes if name in classes]
     others = jnp.array([index for index in range(len(classes)) if index not in priority], jnp.uint8)
     if others.size:
-        rivals = log_odds[others] - params.class_prior[others].reshape(-1, *[1] * known.ndim)
-        label = jnp.where(rivals.max(axis=0) > 0, others[rivals.argmax(axis=0)], label)
+        evident = log_odds[others] > params.class_prior[others].reshape(-1, *[1] * known.ndim)
+        rivals = jnp.where(evident, log_odds[others], -jnp.inf)
+        label = jnp.where(evident.any(axis=0), others[rivals.argmax(axis=0)], label)
     for index in reversed(priority):
         label = jnp.where(jax.nn.sigmoid(log_odds[index]) > params.class_threshold, jnp.uint8(index), label)
     return jnp.where(known, label, jnp.uint8(IGNORE))

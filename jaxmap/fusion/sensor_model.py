@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.geometry.camera import depth_sigma
-from jaxmap.types import FusionParams, FusionRule, GridSpec, StereoCamera
+from jaxmap.types import GridSpec, StereoCamera
 
 _UNROLLED_CLASSES = 8
 
@@ -53,7 +54,7 @@ def frame_evidence(
         if rule.per_frame == "sum":
             amount, shares = points, counts[:-1]
         elif rule.per_frame == "once":
-            amount, shares = (points > 0).astype(jnp.float32), (counts[:-1] > 0).astype(jnp.float32)
+            amount, shares = (points > 0).astype(points.dtype), (counts[:-1] > 0).astype(points.dtype)
         else:
             full = jnp.maximum(points, params.full_evidence_points)
             amount, shares = points / full, counts[:-1] / full

@@ -20,7 +20,8 @@ def disparity_to_depth(
         valid: the disparity is finite and the depth positive.
     """
     shifted = disparity_px + camera.doffs_px
-    valid = jnp.isfinite(shifted) & (shifted > 0)
+    # Well above zero: the gradient of a depth of 10^30 m is not finite.
+    valid = jnp.isfinite(shifted) & (shifted > 1e-6)
     safe = jnp.where(valid, shifted, 1.0)
     return jnp.where(valid, camera.baseline_m * camera.fx_px / safe, 1.0), valid
 

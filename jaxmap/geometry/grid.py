@@ -28,18 +28,6 @@ def world_to_voxel(grid: GridSpec, points_world: Float[Array, "*s 3"]) -> tuple[
     return jnp.where(inside[..., None], scaled, 0.0).astype(jnp.int32), inside
 
 
-def flat_voxel_index(grid: GridSpec, points_world: Float[Array, "*s 3"], keep: Bool[Array, "*s"]) -> Int[Array, "*s"]:
-    """Flat (row-major) voxel indices; points outside or not kept get the number of voxels.
-
-    That number is one past the end: a scatter with `mode="drop"` leaves them out exactly, where -1
-    would wrap round to the last voxel.
-    """
-    index, inside = world_to_voxel(grid, points_world)
-    _, ny, nz = grid.shape
-    flat = (index[..., 0] * ny + index[..., 1]) * nz + index[..., 2]
-    return jnp.where(inside & keep, flat, int(np.prod(grid.shape)))
-
-
 def voxel_centres(grid: GridSpec) -> Float[Array, "X Y Z 3"]:
     """World positions of all voxel centres, in metres."""
     axes = [grid.origin_m[i] + (jnp.arange(grid.shape[i]) + 0.5) * grid.voxel_size_m[i] for i in range(3)]
@@ -51,6 +39,25 @@ class Window(NamedTuple):
 
     start: Int[Array, "3"]
     grid: GridSpec
+
+
+def flat_voxel_index(
+    grid: GridSpec, points_world: Float[Array, "*s 3"], keep: Bool[Array, "*s"], window: Window | None = None
+) -> Int[Array, "*s"]:
+    """Flat (row-major) voxel indices in the window; points outside or not kept get its number of voxels.
+
+    That number is one past the end: a scatter with `mode="drop"` leaves them out exactly, where -1
+    would wrap round to the last voxel.
+    """
+    index, inside = world_to_voxel(grid, points_world)
+    shape = grid.shape
+    if window is not None:
+        # Found in the whole grid and then moved: a point on a face falls into one voxel, whatever the window.
+        index, shape = index - window.start, window.grid.shape
+        inside &= jnp.all((index >= 0) & (index < jnp.array(shape)), axis=-1)
+    _, ny, nz = shape
+    flat = (index[..., 0] * ny + index[..., 1]) * nz + index[..., 2]
+    return jnp.where(inside & keep, flat, int(np.prod(shape)))
 
 
 def whole_window(grid: GridSpec) -> Window:

@@ -82,6 +82,10 @@ def fit_plane_mlesac(
         found = acceptable[best] & enough
         mixture = (sigma_m, outlier_range_m, em_rounds)
         normal, offset, inliers = _refit(sample, normals[best], offsets[best], up_hint, mixture)
+        # Points of a wall may turn the refitted plane over; the hypothesis is acceptable as it is.
+        upright = normal @ up_hint >= jnp.cos(max_tilt_rad)
+        normal = jnp.where(upright, normal, normals[best])
+        offset = jnp.where(upright, offset, offsets[best])
         return Plane(
             normal=jnp.where(found, normal, up_hint),
             offset_m=jnp.where(found, offset - normal @ centre, 0.0),
@@ -119,7 +123,9 @@ def _planes_through(triples: Array, up_hint: Array) -> tuple[Array, Array, Array
     a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
     normals = jnp.cross(b - a, c - a)
     length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
-    proper = length[:, 0] > 1e-9
+    # Three points nearly on a line say nothing of the plane through them.
+    spread = jnp.linalg.norm(b - a, axis=-1) * jnp.linalg.norm(c - a, axis=-1)
+    proper = length[:, 0] > jnp.maximum(1e-9, 1e-2 * spread)
     normals = normals / jnp.where(length > 1e-9, length, 1.0)
     normals = normals * jnp.where(normals @ up_hint < 0, -1.0, 1.0)[:, None]
     return normals, -(normals * a).sum(axis=-1), proper

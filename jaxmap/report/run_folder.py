@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmap.errors import JaxmapError
+from jaxmap.fusion.params import FusionParams, FusionRule, make_fusion_params
 from jaxmap.map_store import MapAttributes, load_map
-from jaxmap.types import FusionParams, FusionRule, VoxelMap, make_fusion_params
+from jaxmap.types import VoxelMap
 
 PICTURE_KINDS = ("left", "disparity", "labels")
 _PICTURE_NAME = re.compile(rf"(?P<frame>.+)_(?P<kind>{'|'.join(PICTURE_KINDS)})\.png")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxmap.errors import JaxmapError
 from jaxmap.types import StereoCamera, make_stereo_camera
@@ -32,12 +33,12 @@ class StereoRig:
 
 def make_stereo_rig(
     *,
-    K_left: np.ndarray,
-    distortion_left: np.ndarray,
-    K_right: np.ndarray,
-    distortion_right: np.ndarray,
-    R_right_left: np.ndarray,
-    t_right_left_m: np.ndarray,
+    K_left: ArrayLike,
+    distortion_left: ArrayLike,
+    K_right: ArrayLike,
+    distortion_right: ArrayLike,
+    R_right_left: ArrayLike,
+    t_right_left_m: ArrayLike,
     size_px: tuple[int, int],
     where: object = "calibration",
 ) -> StereoRig:
@@ -77,6 +78,8 @@ def make_stereo_rig(
         raise JaxmapError("R_right_left is not a rotation", where=where, fix="check the stereo extrinsics")
     if np.linalg.norm(arrays["t_right_left_m"]) < 1e-6:
         raise JaxmapError("the stereo baseline is zero", where=where, fix="check the stereo extrinsics")
+    if min(size_px) < 1:
+        raise JaxmapError(f"the image size is {size_px[0]}x{size_px[1]}", where=where, fix="give a positive size")
     for side in ("K_left", "K_right"):
         if arrays[side][0, 0] <= 0 or arrays[side][1, 1] <= 0:
             raise JaxmapError(f"{side} has a focal length that is not positive", where=where)
@@ -150,4 +153,7 @@ def rectify_image(image: np.ndarray, maps: tuple[np.ndarray, np.ndarray]) -> np.
 
 def rectify_labels(labels: np.ndarray, maps: tuple[np.ndarray, np.ndarray], outside: int) -> np.ndarray:
     """The rectified label image, nearest pixel; outside the raw image it is `outside`."""
-    return cv2.remap(labels, maps[0], maps[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)
+    # OpenCV 5.0 takes the wrong neighbour from fixed-point maps, so they are turned into floats (32nds of a pixel).
+    u_px = maps[0][..., 0] + np.float32(1 / 32) * (maps[1] & 31)
+    v_px = maps[0][..., 1] + np.float32(1 / 32) * (maps[1] >> 5)
+    return cv2.remap(labels, u_px, v_px, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)

@@ -1,0 +1,174 @@
+"""Configurations: files, round trips, defaults that agree with the functions they are for, strictness."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import MISSING, asdict, fields
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxmap.config import (
+    RULE_FIELDS,
+    FusionConfig,
+    GridConfig,
+    MapConfig,
+    PlaneConfig,
+    check_config,
+    config_folder,
+    config_tree,
+    load_config,
+    split_fusion,
+)
+from jaxmap.errors import UsageError
+from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.geometry.plane import fit_plane_mlesac
+from jaxmap.labellers import make_plane_labeller
+from jaxmap.stereo.options import StereoOptions
+
+CONFIGS = sorted(config_folder().glob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_every_config_loads_and_is_read_to_the_last_key(path):
+    config = load_config(str(path))
+    assert config == load_config(path.stem) == load_config(path.name)
+    tree = yaml.safe_load(path.read_text())
+
+    def check(part: dict, whole: dict) -> None:
+        for key, value in part.items():
+            if isinstance(value, dict):
+                check(value, whole[key])
+            else:
+                assert whole[key] == value, key
+
+    check(tree, config_tree(config))
+    assert path.read_text().startswith("#"), "says what it is"
+
+
+def test_there_is_a_config_for_the_paper():
+    fusion = load_config("chiodini2020").fusion
+    assert load_config("chiodini2020").grid.voxel_size_m == 0.2
+    assert (fusion.per_frame, fusion.carve, fusion.range_weighting, fusion.column) == ("once", False, False, "max")
+    assert (fusion.occupancy_hit, fusion.class_hit, fusion.class_miss, fusion.occupancy_miss) == (0.9, 0.9, 0.0, 0.0)
+    assert (fusion.class_prior, fusion.class_threshold) == (0.5, 0.7)
+
+
+configs = st.builds(
+    MapConfig,
+    labeller=st.sampled_from(["plane", "none"]),
+    classes=st.lists(st.sampled_from(["background", "sand", "rock", "grass"]), unique=True).map(tuple),
+    start=st.integers(-5, 5),
+    stop=st.none() | st.integers(-5, 50),
+    stride=st.integers(1, 9),
+    strict=st.booleans(),
+    seed=st.integers(0, 2**31 - 1),
+    grid=st.builds(
+        GridConfig,
+        voxel_size_m=st.floats(0.01, 2) | st.tuples(*[st.floats(0.01, 2)] * 3),
+        lower_m=st.none() | st.tuples(*[st.floats(-1e6, 1e6)] * 3),
+        max_memory_gib=st.floats(0.1, 64),
+    ),
+    stereo=st.builds(StereoOptions, alpha=st.floats(-1, 1), num_disparities=st.none() | st.integers(1, 512)),
+    fusion=st.builds(
+        FusionConfig,
+        per_frame=st.sampled_from(["sum", "once", "mean"]),
+        class_increments=st.none() | st.just(((1.0, -0.5), (-0.25, 0.5))),
+        class_prior=st.floats(0.01, 0.99) | st.tuples(st.floats(0.01, 0.99), st.floats(0.01, 0.99)),
+    ),
+)
+
+
+@given(configs)
+def test_a_config_comes_back_from_its_tree_and_from_yaml(config):
+    tree = config_tree(config)
+    assert check_config(tree) == config
+    assert check_config(yaml.safe_load(yaml.safe_dump(tree))) == config
+    assert config_tree(check_config(tree)) == tree
+
+
+def test_the_defaults_of_fusion_are_those_of_the_functions():
+    params, rule = split_fusion(FusionConfig())
+    assert FusionRule(**rule) == FusionRule()
+    assert {field.name for field in fields(FusionRule)} == set(RULE_FIELDS) == set(rule)
+    signature = inspect.signature(make_fusion_params).parameters
+    defaults = {name: parameter.default for name, parameter in signature.items() if name != "classes"}
+    assert params == defaults
+
+
+def test_the_defaults_of_the_plane_are_those_of_the_functions():
+    config = asdict(PlaneConfig())
+    labeller = inspect.signature(make_plane_labeller).parameters
+    fit = inspect.signature(fit_plane_mlesac).parameters
+    known = {
+        name: parameter.default
+        for name, parameter in {**fit, **labeller}.items()
+        if parameter.default is not inspect.Parameter.empty
+    }
+    assert config == known
+
+
+def test_every_setting_has_a_default_and_says_what_it_is():
+    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, StereoOptions):
+        source = inspect.getsource(kind)
+        for field in fields(kind):
+            assert field.default is not MISSING or field.default_factory is not MISSING, field.name
+            section = field.name in ("grid", "depth", "stereo", "fusion", "plane")
+            assert section or f"    {field.name}: " in source
+        described = source.count('    """') - 1
+        sections = sum(field.name in ("grid", "depth", "stereo", "fusion", "plane") for field in fields(kind))
+        assert described == len(fields(kind)) - sections, kind.__name__
+
+
+@pytest.mark.parametrize(
+    ("tree", "named"),
+    [
+        ({"gird": {}, "grid": {"size": 1}, "fusion": {"carved": True}}, ["gird", "grid.size", "fusion.carved"]),
+        ({"grid": {"voxel_size_m": 0}}, ["grid.voxel_size_m is 0"]),
+        ({"grid": {"voxel_size_m": [0.1, 0.1]}}, ["grid.voxel_size_m"]),
+        ({"grid": {"voxel_size_m": [0.1, -0.1, 0.1]}}, ["grid.voxel_size_m.1 is -0.1"]),
+        ({"grid": {"lower_m": [0, 0]}}, ["grid.lower_m"]),
+        ({"depth": {"min_m": -1, "max_m": 0}}, ["depth.min_m is -1", "depth.max_m is 0"]),
+        ({"depth": {"max_m": float("inf")}}, ["depth.max_m is inf"]),
+        ({"fusion": {"occupancy_miss": 0.1}}, ["fusion.occupancy_miss is 0.1"]),
+        ({"fusion": {"class_prior": [0.5, 1.0]}}, ["fusion.class_prior.1 is 1.0"]),
+        ({"fusion": {"class_hit": float("nan")}}, ["fusion.class_hit is nan"]),
+        ({"fusion": {"per_frame": "twice"}}, ["fusion.per_frame is 'twice'"]),
+        ({"plane": {"hypotheses": 0, "cost": "ransac"}}, ["plane.hypotheses is 0", "plane.cost is 'ransac'"]),
+        ({"stereo": {"alpha": float("nan")}}, ["stereo.alpha is nan"]),
+        ({"stereo": {"mode": "bm", "block_size": 0}}, ["stereo.mode is 'bm'", "stereo.block_size is 0"]),
+        ({"stride": 0, "seed": -1}, ["stride is 0", "seed is -1"]),
+        ({"seed": 2**31}, ["seed is 2147483648"]),
+        ({"labeller": "oracle"}, ["labeller is 'oracle'"]),
+        ({"classes": "rock"}, ["classes is 'rock'"]),
+        ({"grid": None}, ["grid is None"]),
+    ],
+)
+def test_every_fault_is_named_by_its_key(tree, named):
+    with pytest.raises(UsageError) as caught:
+        check_config(tree, where="mine.yaml")
+    assert all(part in str(caught.value) for part in named), str(caught.value)
+    assert "mine.yaml" in str(caught.value)
+
+
+def test_a_file_may_hold_nothing(tmp_path):
+    (tmp_path / "empty.yaml").write_text("# nothing\n")
+    assert load_config(str(tmp_path / "empty.yaml")) == MapConfig()
+
+
+def test_yaml_runs_no_code(tmp_path):
+    (tmp_path / "evil.yaml").write_text("!!python/object/apply:os.mkdir ['" + str(tmp_path / "made") + "']\n")
+    with pytest.raises(UsageError, match=r"evil\.yaml"):
+        load_config(str(tmp_path / "evil.yaml"))
+    assert not (tmp_path / "made").exists()
+
+
+def test_the_params_of_a_config_are_what_it_says():
+    params, _ = split_fusion(load_config("chiodini2020").fusion)
+    made = make_fusion_params(("background", "sand", "rock"), **params)
+    np.testing.assert_allclose(made.class_increments, 0.9 * np.eye(3), atol=1e-7)
+    np.testing.assert_allclose(made.class_prior, 0, atol=1e-7)
+    np.testing.assert_allclose(made.class_threshold, 0.7)
