@@ -49,15 +49,17 @@ def flat_voxel_index(
     That number is one past the end: a scatter with `mode="drop"` leaves them out exactly, where -1
     would wrap round to the last voxel.
     """
-    index, inside = world_to_voxel(grid, points_world)
-    shape = grid.shape
-    if window is not None:
+    start, shape = (jnp.zeros(3), grid.shape) if window is None else (window.start, window.grid.shape)
+    flat, inside = jnp.zeros((), jnp.int32), keep
+    # Axis by axis, because XLA does not vectorise over a last axis of three.
+    for axis in range(3):
+        scaled = jnp.floor((points_world[..., axis] - grid.origin_m[axis]) / grid.voxel_size_m[axis])
         # Found in the whole grid and then moved: a point on a face falls into one voxel, whatever the window.
-        index, shape = index - window.start, window.grid.shape
-        inside &= jnp.all((index >= 0) & (index < jnp.array(shape)), axis=-1)
-    _, ny, nz = shape
-    flat = (index[..., 0] * ny + index[..., 1]) * nz + index[..., 2]
-    return jnp.where(inside & keep, flat, int(np.prod(shape)))
+        scaled = scaled - start[axis]
+        # Tested on floats: a NaN or a huge number cast to int32 would be a valid index.
+        inside = inside & (scaled >= 0) & (scaled < shape[axis])
+        flat = flat * shape[axis] + scaled.astype(jnp.int32)
+    return jnp.where(inside, flat, int(np.prod(shape)))
 
 
 def whole_window(grid: GridSpec) -> Window:

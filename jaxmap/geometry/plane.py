@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from jaxmap.types import Plane
 
 _REFIT_ROUNDS = 5
-_BLOCK = 64
+_BLOCK = 16
 _NORMALISER = 2.5066282746  # sqrt(2 pi)
 
 
@@ -68,8 +68,7 @@ def fit_plane_mlesac(
         normals, offsets, proper = _planes_through(sample[triples], up_hint)
         acceptable = proper & (normals @ up_hint >= jnp.cos(max_tilt_rad))
 
-        def score(normal: Array, offset: Array) -> Array:
-            residuals = sample @ normal + offset
+        def score(residuals: Array) -> Array:
             if cost == "msac":
                 return jnp.minimum(residuals**2, (1.96 * sigma_m) ** 2).sum()
             # Computed once: the rounds of EM only weigh it anew.
@@ -77,7 +76,8 @@ def fit_plane_mlesac(
             gamma = _mixing(density, outlier_range_m, em_rounds)
             return -jnp.log(gamma * density + (1.0 - gamma) / outlier_range_m).sum()
 
-        costs = jnp.where(acceptable, jax.vmap(score)(normals, offsets), jnp.inf)
+        residuals_m = normals @ sample.T + offsets[:, None]
+        costs = jnp.where(acceptable, jax.vmap(score)(residuals_m), jnp.inf)
         best = jnp.argmin(costs)
         found = acceptable[best] & enough
         mixture = (sigma_m, outlier_range_m, em_rounds)
