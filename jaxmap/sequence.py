@@ -66,7 +66,9 @@ def prefetch(function: Callable[[In], Out], items: Iterable[In], workers: int, a
         while pending:
             yield pending.popleft().result()
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        # Not waited for: the garbage collector may close this generator in one of the pool's own threads,
+        # which would wait for itself for ever.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def prepare_frames(

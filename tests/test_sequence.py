@@ -18,7 +18,30 @@ from jaxmap.sequence import prefetch, prepare_frames, run_sequence
 
 
 def own_threads() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name.startswith("jaxmap")]
+    """The threads that are left; nobody waits for them, so they get a moment to end what they are at."""
+    for _ in range(200):
+        left = [thread for thread in threading.enumerate() if thread.name.startswith("jaxmap")]
+        if not left:
+            break
+        time.sleep(0.01)
+    return left
+
+
+def test_a_generator_closed_in_one_of_its_own_threads_does_not_wait_for_itself():
+    suspended, closed = threading.Event(), threading.Event()
+
+    def work(number: int) -> int:
+        if number == 1:
+            suspended.wait()
+            results.close()
+            closed.set()
+        return number
+
+    results = prefetch(work, range(10), 1, 2)
+    assert next(results) == 0
+    suspended.set()
+    assert closed.wait(5)
+    assert own_threads() == []
 
 
 @pytest.mark.parametrize("workers", [1, 4])
