@@ -10,34 +10,17 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmap.datasets.pose_files import read_poses, write_tum
-from jaxmap.errors import JaxmapError
 from jaxmap.export.geotiff import write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
 from jaxmap.files import atomic_path
-from jaxmap.fusion.params import FusionParams, FusionRule, make_fusion_params
+from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
 from jaxmap.map_store import MapAttributes
 from jaxmap.report.pictures import colourise_disparity, overlay_labels, top_down_picture
 from jaxmap.run_folder import RunFolder
 from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.types import VoxelMap
-
-
-def stored_fusion(attributes: MapAttributes, classes: tuple[str, ...]) -> tuple[FusionParams, FusionRule]:
-    """The parameters and the rule that a map was fused with, from its attributes.
-
-    Raises:
-        JaxmapError: the attributes hold none, or some that this version does not know.
-    """
-    try:
-        rule = dict(attributes.fusion["rule"])
-        rule["priority_classes"] = tuple(rule["priority_classes"])
-        return make_fusion_params(classes, **attributes.fusion["params"]), FusionRule(**rule)
-    except (KeyError, TypeError) as error:
-        raise JaxmapError(
-            f"the map's fusion attributes cannot be used: {error}", fix="map the sequence again"
-        ) from error
 
 
 def write_poses(
@@ -71,7 +54,7 @@ def write_exports(
     folder: RunFolder, voxel_map: VoxelMap, attributes: MapAttributes, formats: Sequence[str] = tuple(EXPORTS)
 ) -> None:
     """Writes the map in other forms; the picture shows the path of poses.tum, where there is one."""
-    params, rule = stored_fusion(attributes, voxel_map.classes)
+    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
     if "ply" in formats:
         write_ply(folder.ply, occupied_voxels(voxel_map, params, rule), voxel_map.classes, attributes.site_origin)
     top: TopDown = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))

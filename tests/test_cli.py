@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
+from fixtures import cli, finished_run, map_words, scene_folder, shared_cache  # noqa: F401
 
 import jaxmap
 from jaxmap.cache import cache_folder
@@ -70,7 +71,7 @@ def option_names(kind: type, prefix: str = "") -> list[str]:
 
 
 def test_the_help_of_map_mentions_every_option_and_says_what_it_does(cli, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "80")
     text = cli("map", "--help").out
     for name in [*option_names(MapConfig), "out", "config", "resume", "overwrite", "checkpoint-every-s"]:
         # A switch that is on by default is shown by what turns it off.
@@ -169,3 +170,24 @@ def test_a_config_named_twice_counts_once(cli, scene_folder, tmp_path):
         assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["stop"] == 2, "the last one counts"
     else:
         assert outcome.status == 2
+
+
+@pytest.mark.parametrize("form", ["ply", "geotiff", "png", "all"])
+def test_export_writes_the_forms_anew(form, cli, finished_run, tmp_path):
+    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    names = {"ply": ["map.ply"], "geotiff": ["bev.tif"], "png": ["bev.png"], "all": ["map.ply", "bev.tif", "bev.png"]}
+    before = {name: (run / name).read_bytes() for name in names["all"]}
+    for name in names["all"]:
+        (run / name).unlink()
+    assert cli("export", run, "--format", form).status == 0
+    assert [name for name in names["all"] if (run / name).exists()] == names[form]
+    assert "map.ply" not in names[form] or (run / "map.ply").read_bytes() == before["map.ply"]
+
+
+def test_report_writes_the_page_anew(cli, finished_run, tmp_path):
+    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    (run / "report.html").unlink()
+    outcome = cli("report", run)
+    assert outcome.status == 0
+    assert "report.html" in outcome.out
+    assert "<html" in (run / "report.html").read_text()

@@ -19,10 +19,10 @@ from jaxmap.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
+from jaxmap.fusion.params import stored_fusion
 from jaxmap.map_store import load_map
 from jaxmap.mapping import Plan, plan_run, run_plan
 from jaxmap.run_folder import RunFolder
-from jaxmap.run_outputs import stored_fusion
 from jaxmap.sequence import prepare_frames
 
 OUTPUTS = ("map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "config.yaml", "poses.tum", "report.html")
@@ -56,7 +56,7 @@ def log_odds(run: Path) -> np.ndarray:
 
 def voxels_of(run: Path) -> OccupiedVoxels:
     voxel_map, attributes = load_map(run / "map.zarr")
-    return occupied_voxels(voxel_map, *stored_fusion(attributes, voxel_map.classes))
+    return occupied_voxels(voxel_map, *stored_fusion(attributes.fusion, voxel_map.classes, "map"))
 
 
 def metrics_of(run: Path) -> dict:
@@ -266,6 +266,16 @@ def test_strict_stops_at_the_first_unusable_frame(scene_copy, tmp_path):
         ran(scene_copy, tmp_path / "run", strict=True)
 
 
+def test_a_priority_class_that_is_none_is_refused(scene_folder):
+    with pytest.raises(JaxmapError, match="stone"):
+        planned(scene_folder, fusion={"priority_classes": ["stone"]})
+
+
+def test_a_class_named_twice_is_refused(scene_folder):
+    with pytest.raises(JaxmapError, match="rock"):
+        planned(scene_folder, classes=["sand", "rock", "rock"])
+
+
 def test_no_usable_frame_at_all_is_an_error(scene_copy, tmp_path):
     shutil.rmtree(scene_copy / "right")
     (scene_copy / "right").mkdir()
@@ -302,24 +312,3 @@ def test_the_front_end_of_a_plan_sees_the_true_depth(scene_folder):
     assert prepared.ref.name == frame_name(0)
     np.testing.assert_allclose(prepared.frame.T_world_camera.as_matrix(), pose(0), atol=1e-6)
     assert prepared.frame.disparity_px.dtype == jnp.float32
-
-
-@pytest.mark.parametrize("form", ["ply", "geotiff", "png", "all"])
-def test_export_writes_the_forms_anew(form, cli, finished_run, tmp_path):
-    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
-    names = {"ply": ["map.ply"], "geotiff": ["bev.tif"], "png": ["bev.png"], "all": ["map.ply", "bev.tif", "bev.png"]}
-    before = {name: (run / name).read_bytes() for name in names["all"]}
-    for name in names["all"]:
-        (run / name).unlink()
-    assert cli("export", run, "--format", form).status == 0
-    assert [name for name in names["all"] if (run / name).exists()] == names[form]
-    assert "map.ply" not in names[form] or (run / "map.ply").read_bytes() == before["map.ply"]
-
-
-def test_report_writes_the_page_anew(cli, finished_run, tmp_path):
-    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
-    (run / "report.html").unlink()
-    outcome = cli("report", run)
-    assert outcome.status == 0
-    assert "report.html" in outcome.out
-    assert "<html" in (run / "report.html").read_text()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -146,6 +146,29 @@ def make_fusion_params(
         occupancy_threshold=leaf(occupancy_threshold),
         class_threshold=leaf(class_threshold),
     )
+
+
+def stored_fusion(fusion: Mapping[str, Any], classes: Sequence[str], where: object) -> tuple[FusionParams, FusionRule]:
+    """The parameters and the rule that a map was fused with, from its `fusion` attribute.
+
+    Args:
+        fusion: `params`, the arguments of `make_fusion_params`, and `rule`, those of `FusionRule`; what
+            is absent is the default.
+        classes: the map's classes.
+        where: the map, for the error.
+
+    Raises:
+        JaxmapError: the attribute is not of this form, or holds what this version does not know.
+    """
+    try:
+        rule: dict[str, Any] = dict(fusion.get("rule", {}))
+        # JSON knows no tuples.
+        rule = {name: tuple(value) if isinstance(value, list) else value for name, value in rule.items()}
+        return make_fusion_params(classes, **fusion.get("params", {})), FusionRule(**rule)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise JaxmapError(
+            f"the attribute fusion is not understood ({error})", where=where, fix="map the sequence again"
+        ) from error
 
 
 def _increment_matrix(

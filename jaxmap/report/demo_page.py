@@ -11,7 +11,7 @@ from jaxmap.files import atomic_path
 from jaxmap.report.html import in_3d
 from jaxmap.report.inline import inline_image
 from jaxmap.report.page import page
-from jaxmap.report.run_folder import read_run
+from jaxmap.report.run_contents import read_run
 from jaxmap.report.wording import value_text
 
 Row = Mapping[str, object]

@@ -14,7 +14,7 @@ from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.files import atomic_path
 from jaxmap.report.inline import inline_image, script_text
 from jaxmap.report.page import page
-from jaxmap.report.run_folder import PICTURE_KINDS, RunFolder, read_run
+from jaxmap.report.run_contents import PICTURE_KINDS, RunContents, read_run
 from jaxmap.report.tables import group, metric_tables
 from jaxmap.report.voxel_view import voxel_view
 from jaxmap.report.wording import value_text
@@ -63,11 +63,11 @@ def write_report(run: Path) -> Path:
     return target
 
 
-def _name(folder: RunFolder) -> str:
+def _name(folder: RunContents) -> str:
     return str(group(folder.metrics, "sequence").get("name") or folder.path.resolve().name)
 
 
-def _header(folder: RunFolder, voxels: OccupiedVoxels) -> str:
+def _header(folder: RunContents, voxels: OccupiedVoxels) -> str:
     metrics, sequence = folder.metrics, group(folder.metrics, "sequence")
     facts = [
         sequence.get("dataset"),
@@ -88,7 +88,7 @@ def _header(folder: RunFolder, voxels: OccupiedVoxels) -> str:
     )
 
 
-def _stats(folder: RunFolder, voxels: OccupiedVoxels) -> list[tuple[str, str]]:
+def _stats(folder: RunContents, voxels: OccupiedVoxels) -> list[tuple[str, str]]:
     sequence, times = group(folder.metrics, "sequence"), group(folder.metrics, "times")
     skipped = sequence.get("skipped")
     cell_m2 = float(np.prod(voxels.voxel_size_m[:2].astype(np.float64)))
@@ -111,7 +111,7 @@ def _memory(mib: float) -> str:
     return value_text(round(mib / 1024, 2), "GiB") if mib >= 1024 else value_text(round(mib), "MiB")
 
 
-def _from_above(folder: RunFolder, remarks: list[str]) -> str:
+def _from_above(folder: RunContents, remarks: list[str]) -> str:
     path = folder.path / "bev.png"
     if not path.is_file():
         return ""
@@ -123,7 +123,7 @@ def _from_above(folder: RunFolder, remarks: list[str]) -> str:
     return f'<section><h2>From above</h2><div class="paper">{image}</div></section>'
 
 
-def in_3d(folder: RunFolder, voxels: OccupiedVoxels) -> str:
+def in_3d(folder: RunContents, voxels: OccupiedVoxels) -> str:
     """The section with the interactive view; a page holds one at most."""
     if not len(voxels.label):
         return "<section><h2>In 3D</h2><p>No voxel is occupied.</p></section>"
@@ -136,7 +136,7 @@ def in_3d(folder: RunFolder, voxels: OccupiedVoxels) -> str:
     )
 
 
-def _key_frames(folder: RunFolder, remarks: list[str]) -> str:
+def _key_frames(folder: RunContents, remarks: list[str]) -> str:
     frames = list(folder.pictures)
     if len(frames) > MAX_KEY_FRAMES:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, MAX_KEY_FRAMES).round().astype(int)]
@@ -180,7 +180,7 @@ def _notes(metrics: dict[str, Any], remarks: list[str]) -> str:
     return f"<section><h2>Notes</h2><ul>{items}</ul></section>" if items else ""
 
 
-def _configuration(folder: RunFolder) -> str:
+def _configuration(folder: RunContents) -> str:
     if not folder.config_text:
         return ""
     return (
@@ -189,7 +189,7 @@ def _configuration(folder: RunFolder) -> str:
     )
 
 
-def _links(folder: RunFolder) -> str:
+def _links(folder: RunContents) -> str:
     items = "".join(
         f'<li><a href="{quote(name)}">{name}</a><span>{told}</span></li>'
         for name, told in _FILES.items()

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionParams, FusionRule, make_fusion_params
+from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
 from jaxmap.map_store import MapAttributes, load_map
 from jaxmap.types import VoxelMap
 
@@ -21,7 +22,7 @@ _PICTURE_NAME = re.compile(rf"(?P<frame>.+)_(?P<kind>{'|'.join(PICTURE_KINDS)})\
 
 
 @dataclass(frozen=True)
-class RunFolder:
+class RunContents:
     """A run that was read.
 
     Attributes:
@@ -44,7 +45,7 @@ class RunFolder:
     remarks: tuple[str, ...]
 
 
-def read_run(run: Path) -> RunFolder:
+def read_run(run: Path) -> RunContents:
     """Reads a run folder.
 
     Raises:
@@ -54,10 +55,10 @@ def read_run(run: Path) -> RunFolder:
     if not run.is_dir():
         raise JaxmapError("no such run folder", where=run, fix="give a folder that `jaxmap map` wrote")
     voxel_map, attributes = load_map(run / "map.zarr")
-    params, rule = _fusion(voxel_map, attributes, run / "map.zarr")
+    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, run / "map.zarr")
     trajectory_world, remarks = _trajectory(run / "poses.tum", attributes.site_origin)
     config = run / "config.yaml"
-    return RunFolder(
+    return RunContents(
         path=run,
         voxel_map=voxel_map,
         attributes=attributes,
@@ -69,19 +70,6 @@ def read_run(run: Path) -> RunFolder:
         config_text=config.read_text(encoding="utf-8", errors="replace") if config.is_file() else "",
         remarks=remarks,
     )
-
-
-def _fusion(voxel_map: VoxelMap, attributes: MapAttributes, where: Path) -> tuple[FusionParams, FusionRule]:
-    try:
-        params = make_fusion_params(voxel_map.classes, **attributes.fusion.get("params", {}))
-        # JSON knows no tuples.
-        rule: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in attributes.fusion.get("rule", {}).items()
-        }
-        return params, FusionRule(**rule)
-    except (TypeError, ValueError, AttributeError) as error:
-        raise JaxmapError(f"the attribute fusion is not understood ({error})", where=where, fix="map again") from error
 
 
 def _metrics(path: Path) -> dict[str, Any]:
@@ -103,11 +91,9 @@ def _trajectory(
     if not path.is_file():
         return None, ()
     try:
-        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.split("#")[0].strip()]
-        positions = np.array([[float(number) for number in row[1:4]] for row in rows], np.float64).reshape(-1, 3)
-    except (OSError, ValueError):
+        return read_poses(path).T[:, :3, 3] - site_origin, ()
+    except JaxmapError:
         return None, (f"{path.name} could not be read: the path is left out.",)
-    return (positions - site_origin, ()) if len(positions) else (None, ())
 
 
 def _pictures(folder: Path) -> dict[str, dict[str, Path]]:
