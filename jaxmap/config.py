@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -67,8 +68,8 @@ class FusionConfig:
     """Let points count less as depth noise outgrows the voxel."""
     column: Literal["max", "sum"] = "sum"
     """Top-down map: the greatest evidence in a column, or the sum of it."""
-    priority_classes: tuple[str, ...] = ("rock",)
-    """Classes that win a cell as soon as they pass class_threshold."""
+    priority_classes: tuple[str, ...] | None = None
+    """Classes that win a cell as soon as they pass class_threshold; by default rock, if it is a class."""
     occupancy_hit: Annotated[float, Ge(0)] = 0.85
     """Log-odds that a frame with points in a voxel adds to its occupancy."""
     occupancy_miss: Annotated[float, Interval(le=0)] = -0.4
@@ -92,6 +93,9 @@ class FusionConfig:
     class_threshold: Probability = 0.5
     """A priority class wins above this probability."""
 
+
+DEFAULT_PRIORITY = ("rock",)
+"""Classes that take a cell before others do, where nothing else is said."""
 
 RULE_FIELDS = ("per_frame", "carve", "range_weighting", "column", "priority_classes")
 """The fields of `FusionConfig` that make a `FusionRule`; the others make `FusionParams`."""
@@ -194,11 +198,11 @@ def load_config(name_or_path: str) -> MapConfig:
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"not YAML: {error}", where=path) from error
+        raise UsageError(f"not YAML: {error}", where=path, fix="correct the file") from error
     except OSError as error:
         raise UsageError(f"cannot be read: {error.strerror}", where=path) from error
     if not isinstance(tree or {}, dict):
-        raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path)
+        raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
     return check_config(tree or {}, where=path)
 
 
@@ -220,10 +224,22 @@ def config_tree(config: MapConfig) -> dict[str, Any]:
     return _ADAPTER.dump_python(config, mode="json")
 
 
-def split_fusion(fusion: FusionConfig) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The keyword arguments of `make_fusion_params` and those of `FusionRule`."""
+def split_fusion(fusion: FusionConfig, classes: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The keyword arguments of `make_fusion_params` and those of `FusionRule`, for a map of these classes.
+
+    Raises:
+        UsageError: a priority class is none of the classes.
+    """
     tree = asdict(fusion)
     rule = {name: tree.pop(name) for name in RULE_FIELDS}
+    if fusion.priority_classes is None or not classes:
+        rule["priority_classes"] = tuple(name for name in DEFAULT_PRIORITY if name in classes)
+    elif unknown := [name for name in fusion.priority_classes if name not in classes]:
+        raise UsageError(
+            f"{', '.join(unknown)} is not one of the classes {' '.join(classes)}",
+            where="fusion.priority_classes",
+            fix="name classes of the map, or none",
+        )
     return tree, rule
 
 

@@ -29,3 +29,7 @@ class UsageError(JaxmapError):
 
 class FrameError(JaxmapError):
     """One frame that cannot be used; a sequence goes on without it unless it is strict."""
+
+    def at(self, where: object) -> FrameError:
+        """This error; placed there, if it does not say where it is."""
+        return self if self.where else FrameError(self.what, where=where, fix=self.fix)

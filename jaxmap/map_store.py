@@ -78,6 +78,12 @@ def save_map(path: str | os.PathLike[str], voxel_map: VoxelMap, attributes: MapA
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def holds_map(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a map, be it one that a crash has left set aside."""
+    target = Path(path)
+    return target.exists() or _set_aside(target).exists()
+
+
 def load_map(path: str | os.PathLike[str]) -> tuple[VoxelMap, MapAttributes]:
     """Reads a map; where a save was cut off between its renames, the map from before it.
 

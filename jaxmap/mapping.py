@@ -1,124 +1,22 @@
-"""A mapping run from a sequence to its outputs: what `jaxmap map` and `jaxmap demo` do."""
+"""A mapping run from its plan to its outputs: what `jaxmap map` and `jaxmap demo` do."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 import jaxmap
-from jaxmap.config import MapConfig, split_fusion
-from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
-from jaxmap.datasets.label_files import LabelFolder, open_label_folder
-from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
-from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
+from jaxmap.errors import JaxmapError
 from jaxmap.map_store import MapAttributes, save_map
-from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.report.html import write_report
 from jaxmap.run_folder import RunFolder, RunLog, peak_resident_mib, write_json
 from jaxmap.run_outputs import count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
-from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.types import GridSpec, VoxelMap, make_grid
-
-Tell = Callable[[str], None]
-
-_KEY_FRAMES = 4
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A run, decided in full before the first frame is fused."""
-
-    sequence: StereoSequence
-    front_end: StereoFrontEnd
-    labeller: Labeller
-    label_folder: LabelFolder | None
-    grid: GridSpec
-    depth_range_m: tuple[float, float]
-    rule: FusionRule
-    params: MapperParams
-    fusion: dict[str, Any]
-    mapper: Mapper
-    key: PRNGKeyArray
-
-    @property
-    def key_frames(self) -> set[int]:
-        """Indices of the frames whose pictures are kept."""
-        return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
-
-
-def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
-    """Opens the sequence and decides range, bounds, labeller and step.
-
-    Args:
-        source: the folder of one sequence, or `sample:NAME`.
-        config: the settings.
-        tell: takes lines for the user.
-
-    Raises:
-        JaxmapError: the data or the settings do not serve.
-    """
-    options = ReadOptions(
-        dataset=config.dataset,
-        poses=config.poses,
-        poses_world=config.poses_world,
-        calibration=config.calibration,
-        start=config.start,
-        stop=config.stop,
-        stride=config.stride,
-        max_pose_gap_s=config.max_pose_gap_s,
-    )
-    sequence = open_sequence(source, options)
-    front_end = StereoFrontEnd(sequence.camera, config.stereo)
-    camera = front_end.camera
-    tell(
-        f"{sequence.name} ({sequence.dataset}): {len(sequence.frames)} frames "
-        f"of {camera.width_px} x {camera.height_px} px, f {float(camera.fx_px):.2f} px, "
-        f"baseline {float(camera.baseline_m):.5f} m"
-    )
-    for note in sequence.notes:
-        tell(f"note: {note}")
-
-    max_depth_m = config.depth.max_m or usable_depth(camera, config.depth.max_sigma_m, config.fusion.disparity_sigma_px)
-    if not config.depth.min_m < max_depth_m:
-        raise UsageError(
-            f"depth.min_m {config.depth.min_m} is not below the greatest depth, {max_depth_m} m",
-            fix="set --depth.max-m",
-        )
-    depth_range_m = (config.depth.min_m, max_depth_m)
-    labeller, label_folder = _labeller(config, sequence)
-    grid = _grid(config, sequence, front_end, max_depth_m)
-    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
-    tell(
-        f"depth {depth_range_m[0]:g} to {max_depth_m:g} m; grid {' x '.join(map(str, grid.shape))} voxels of {size} m, "
-        f"{1 + len(labeller.classes)} channels: {map_bytes(grid, len(labeller.classes)) / 2**20:.0f} MiB"
-    )
-    check_memory(grid, len(labeller.classes), config.grid.max_memory_gib)
-
-    params, rule = split_fusion(config.fusion)
-    fusion_rule = FusionRule(**rule)
-    mapper_params = MapperParams(camera, make_fusion_params(labeller.classes, **params))
-    return Plan(
-        sequence=sequence,
-        front_end=front_end,
-        labeller=labeller,
-        label_folder=label_folder,
-        grid=grid,
-        depth_range_m=depth_range_m,
-        rule=fusion_rule,
-        params=mapper_params,
-        fusion={"params": params, "rule": rule},
-        mapper=make_mapper(camera, grid, labeller, fusion_rule, depth_range_m),
-        key=jax.random.key(config.seed),
-    )
+from jaxmap.types import VoxelMap
 
 
 def run_plan(
@@ -149,7 +47,7 @@ def run_plan(
     Raises:
         JaxmapError: no frame could be fused, or an output cannot be written.
     """
-    voxel_map, log = folder.resume_point() or (plan.mapper.init(), RunLog())
+    voxel_map, log = _resumed(plan, folder) or (plan.mapper.init(), RunLog())
     if log.complete:
         tell("the run is complete already; its outputs are written anew")
     elif log.next_index:
@@ -173,7 +71,7 @@ def run_plan(
             saved_s = resumed_s = time.perf_counter()
     log.total_s += time.perf_counter() - resumed_s
     if not log.fused:
-        raise JaxmapError(f"no frame could be fused: {log.skipped[0]['reason']}", where=plan.sequence.name)
+        raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
     attributes = _attributes(plan, log)
@@ -187,7 +85,37 @@ def run_plan(
     metrics = _metrics(plan, log, voxel_map)
     write_json(folder.metrics, metrics)
     write_report(folder.path)
+    if not metrics["voxels"]["occupied"]:
+        tell("note: no voxel is occupied: check the bounds, the range and the poses")
     return metrics
+
+
+def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
+    """Where an interrupted run of the same plan has got to.
+
+    Raises:
+        JaxmapError: the sequence has changed since, so that the run cannot go on as if it had not.
+    """
+    saved = folder.resume_point()
+    if saved is None:
+        return None
+    voxel_map, log = saved
+    done = {*log.fused, *(skipped["frame"] for skipped in log.skipped)}
+    names = [frame.name for frame in plan.sequence.frames]
+    same_frames = done == set(names[: log.next_index]) and (not log.complete or log.next_index == len(names))
+    same_grid = (
+        voxel_map.grid.shape == plan.grid.shape
+        and voxel_map.classes == plan.labeller.classes
+        and np.array_equal(voxel_map.grid.origin_m, plan.grid.origin_m)
+        and np.array_equal(voxel_map.grid.voxel_size_m, plan.grid.voxel_size_m)
+    )
+    if not (same_frames and same_grid):
+        raise JaxmapError(
+            f"the {'frames' if same_grid else 'bounds of the map'} are not those that the run was begun with",
+            where=folder.path,
+            fix="bring the sequence back as it was, or map it anew with --overwrite",
+        )
+    return saved
 
 
 def _attributes(plan: Plan, log: RunLog) -> MapAttributes:
@@ -260,29 +188,3 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "peak_resident_mib": round(peak_resident_mib(), 1),
         },
     }
-
-
-def _labeller(config: MapConfig, sequence: StereoSequence) -> tuple[Labeller, LabelFolder | None]:
-    if config.labeller == "none":
-        return make_no_labeller(), None
-    if config.labeller == "plane":
-        return make_plane_labeller(config.classes, **asdict(config.plane)), None
-    if config.labels is None:
-        raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
-    folder = open_label_folder(config.labels, len(config.classes), config.labels_are, sequence.frames[0].name)
-    return make_files_labeller(config.classes, soft=folder.soft), folder
-
-
-def _grid(config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float) -> GridSpec:
-    settings = config.grid
-    if (settings.lower_m is None) != (settings.upper_m is None):
-        raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
-    if settings.lower_m is not None and settings.upper_m is not None:
-        return make_grid(settings.lower_m, settings.upper_m, settings.voxel_size_m)
-    return grid_around_views(
-        front_end.camera,
-        sequence.T_world_camera @ front_end.T_raw_rectified,
-        max_depth_m,
-        settings.voxel_size_m,
-        (settings.below_camera_m, settings.above_camera_m),
-    )

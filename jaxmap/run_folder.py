@@ -14,7 +14,7 @@ import numpy as np
 from jaxmap.config import MapConfig, config_tree
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.files import atomic_path
-from jaxmap.map_store import load_map
+from jaxmap.map_store import holds_map, load_map
 from jaxmap.sequence import FusedFrame
 from jaxmap.types import VoxelMap
 
@@ -101,10 +101,12 @@ class RunFolder:
             UsageError: the run to be resumed had other settings.
         """
         tree = {"sequence": sequence, **config_tree(config)}
-        if self.config.exists() and resume:
+        # A run that has failed before its first save has left nothing to lose.
+        used = holds_map(self.map) or self.metrics.exists()
+        if used and resume:
             self._check_same(tree)
             return
-        if self.config.exists() and not overwrite:
+        if used and not overwrite:
             raise JaxmapError(
                 "the folder holds a run already",
                 where=self.path,
@@ -126,12 +128,9 @@ class RunFolder:
         Raises:
             JaxmapError: there is a map, but it cannot be read.
         """
-        try:
-            voxel_map, attributes = load_map(self.map)
-        except JaxmapError:
-            if self.map.exists():
-                raise
+        if not holds_map(self.map):
             return None
+        voxel_map, attributes = load_map(self.map)
         return voxel_map, RunLog(**attributes.progress)
 
     def _check_same(self, tree: dict[str, Any]) -> None:
@@ -144,6 +143,7 @@ class RunFolder:
                 f"cannot be read: {error}", where=self.config, fix="start anew with --overwrite"
             ) from error
         before = before if isinstance(before, dict) else {}
+        before, tree = _dotted(before), _dotted(tree)
         differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))
         if differing:
             raise UsageError(
@@ -161,6 +161,14 @@ class RunFolder:
             file.unlink(missing_ok=True)
         for picture in self.pictures.glob("*.png"):
             picture.unlink()
+
+
+def _dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A tree of settings as one level, with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
 
 
 def write_yaml(path: Path, tree: dict[str, Any]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -94,7 +93,6 @@ def prepare_frames(
         JaxmapError: the first readable pair has left and right swapped.
     """
     T_world_camera = sequence.T_world_camera @ front_end.T_raw_rectified
-    order_checked = threading.Event()
 
     def prepare(index: int) -> PreparedFrame:
         ref = sequence.frames[index]
@@ -104,9 +102,6 @@ def prepare_frames(
             stages_s = {"read": time.perf_counter() - started_s}
             rectified = front_end(pair.left, pair.right)
             stages_s |= {"rectify": rectified.rectify_s, "match": rectified.match_s}
-            if not order_checked.is_set():
-                order_checked.set()
-                front_end.check_order(rectified)
             labels: dict[str, Any] = {}
             if label_folder is not None:
                 started_s = time.perf_counter()
@@ -115,10 +110,15 @@ def prepare_frames(
             pose = jaxlie.SE3.from_matrix(jnp.asarray(T_world_camera[index], jnp.float32))
             frame = Frame(jnp.asarray(rectified.disparity_px), pose, **labels)
         except FrameError as fault:
-            return PreparedFrame(index, ref, fault=fault)
+            return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)
 
-    return prefetch(prepare, range(first, len(sequence.frames)), workers, ahead)
+    order_checked = False
+    for prepared in prefetch(prepare, range(first, len(sequence.frames)), workers, ahead):
+        if prepared.rectified is not None and not order_checked:
+            front_end.check_order(prepared.rectified, f"frame {prepared.ref.name}")
+            order_checked = True
+        yield prepared
 
 
 def run_sequence(

@@ -6,6 +6,7 @@ centres; the world is x east, y north, z up, in metres, float32 relative to a fl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -160,7 +161,7 @@ def make_voxel_map(grid: GridSpec, classes: Sequence[str]) -> VoxelMap:
         JaxmapError: the tensor would have more elements than a 32-bit index can reach.
     """
     shape = (1 + len(classes), *grid.shape)
-    if np.prod(shape, dtype=np.int64) > MAX_TENSOR_ELEMENTS:
+    if math.prod(shape) > MAX_TENSOR_ELEMENTS:
         raise JaxmapError(
             f"a map of {shape[0]} channels x {' x '.join(map(str, grid.shape))} voxels passes 2^31 numbers",
             where="grid",

@@ -27,6 +27,7 @@ from jaxmap.errors import UsageError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.labellers import make_plane_labeller
+from jaxmap.labels import ROVER_CLASSES
 from jaxmap.stereo.options import StereoOptions
 
 CONFIGS = sorted(config_folder().glob("*.yaml"))
@@ -91,7 +92,7 @@ def test_a_config_comes_back_from_its_tree_and_from_yaml(config):
 
 
 def test_the_defaults_of_fusion_are_those_of_the_functions():
-    params, rule = split_fusion(FusionConfig())
+    params, rule = split_fusion(FusionConfig(), ROVER_CLASSES)
     assert FusionRule(**rule) == FusionRule()
     assert {field.name for field in fields(FusionRule)} == set(RULE_FIELDS) == set(rule)
     signature = inspect.signature(make_fusion_params).parameters
@@ -167,7 +168,7 @@ def test_yaml_runs_no_code(tmp_path):
 
 
 def test_the_params_of_a_config_are_what_it_says():
-    params, _ = split_fusion(load_config("chiodini2020").fusion)
+    params, _ = split_fusion(load_config("chiodini2020").fusion, ROVER_CLASSES)
     made = make_fusion_params(("background", "sand", "rock"), **params)
     np.testing.assert_allclose(made.class_increments, 0.9 * np.eye(3), atol=1e-7)
     np.testing.assert_allclose(made.class_prior, 0, atol=1e-7)

@@ -43,6 +43,7 @@ FLOORS = {
     "jaxmap.run_folder": 7,
     "jaxmap.run_outputs": 7,
     "jaxmap.mapping": 7,
+    "jaxmap.mapping_plan": 7,
     # 8: the command line
     "jaxmap.commands": 8,
     "jaxmap.cli": 8,
@@ -59,6 +60,7 @@ SAME_FLOOR = {
     ("jaxmap.sequence", "jaxmap.labellers"),
     ("jaxmap.sequence", "jaxmap.datasets"),
     ("jaxmap.run_outputs", "jaxmap.run_folder"),
+    ("jaxmap.mapping", "jaxmap.mapping_plan"),
     ("jaxmap.mapping", "jaxmap.run_folder"),
     ("jaxmap.mapping", "jaxmap.run_outputs"),
     ("jaxmap.cli", "jaxmap.commands"),

@@ -21,7 +21,8 @@ from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import stored_fusion
 from jaxmap.map_store import load_map
-from jaxmap.mapping import Plan, plan_run, run_plan
+from jaxmap.mapping import run_plan
+from jaxmap.mapping_plan import Plan, plan_run
 from jaxmap.run_folder import RunFolder
 from jaxmap.sequence import prepare_frames
 
@@ -279,7 +280,7 @@ def test_a_class_named_twice_is_refused(scene_folder):
 def test_no_usable_frame_at_all_is_an_error(scene_copy, tmp_path):
     shutil.rmtree(scene_copy / "right")
     (scene_copy / "right").mkdir()
-    with pytest.raises(JaxmapError, match="no frame could be fused: .*right/f000.png"):
+    with pytest.raises(JaxmapError, match="none of 6 frames could be fused; the first: .*right/f000.png"):
         ran(scene_copy, tmp_path / "run")
 
 

@@ -28,18 +28,18 @@ def parse(
     defaults = {}
     if with_config is not None and (name := _value_of("--config", words)) is not None:
         defaults["default"] = with_config(name)
-    return tyro.cli(
-        kind, prog=f"jaxmap {command}", args=list(words), config=(tyro.conf.FlagCreatePairsOff,), **defaults
-    )
+    return tyro.cli(kind, prog=f"jaxmap {command}", args=list(words), **defaults)
 
 
 def _value_of(option: str, words: Sequence[str]) -> str | None:
+    """The value of an option, the last one where it is given twice."""
+    value = None
     for index, word in enumerate(words):
         if word == option and index + 1 < len(words):
-            return words[index + 1]
-        if word.startswith(f"{option}="):
-            return word.partition("=")[2]
-    return None
+            value = words[index + 1]
+        elif word.startswith(f"{option}="):
+            value = word.partition("=")[2]
+    return value
 
 
 class Console:

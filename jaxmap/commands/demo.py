@@ -60,7 +60,8 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.cache import keep_compiled_programs
     from jaxmap.evaluation.motorcycle import score_motorcycle
     from jaxmap.map_store import load_map
-    from jaxmap.mapping import plan_run, run_plan
+    from jaxmap.mapping import run_plan
+    from jaxmap.mapping_plan import plan_run
     from jaxmap.report.demo_page import write_demo_page
     from jaxmap.run_folder import RunFolder, write_json
 

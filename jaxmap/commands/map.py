@@ -11,6 +11,7 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.config import MapConfig, check_config, config_tree, load_config
+from jaxmap.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -40,10 +41,15 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(MapArguments, "map", words, with_config=_with_config)
     config = check_config(config_tree(arguments.settings))
+    if arguments.resume and arguments.overwrite:
+        raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
+    if not arguments.checkpoint_every_s >= 0:
+        raise UsageError(f"--checkpoint-every-s is {arguments.checkpoint_every_s}", fix="give seconds from 0 on")
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.cache import keep_compiled_programs
-    from jaxmap.mapping import plan_run, run_plan
+    from jaxmap.mapping import run_plan
+    from jaxmap.mapping_plan import plan_run
     from jaxmap.run_folder import RunFolder
 
     keep_compiled_programs()

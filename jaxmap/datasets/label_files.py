@@ -73,7 +73,7 @@ class LabelFolder:
                 f"an array {array.shape} of {array.dtype}", where=path, fix=f"give floats (H, W, {self.class_count})"
             )
         array = array.astype(np.float32)
-        if not np.isfinite(array).all() or array.min() < 0 or array.sum(axis=2).max() > 1.01:
+        if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.sum(axis=2).max(initial=0) > 1.01:
             raise FrameError(
                 "the probabilities are not finite, not negative, or sum to more than 1",
                 where=path,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from jaxmap.errors import JaxmapError
@@ -44,7 +46,8 @@ def grid_around_views(
 
 def map_bytes(grid: GridSpec, class_count: int) -> int:
     """Memory of a map's tensor, float32."""
-    return 4 * (1 + class_count) * int(np.prod(grid.shape, dtype=np.int64))
+    # Of Python integers: NumPy's would wrap round.
+    return 4 * (1 + class_count) * math.prod(grid.shape)
 
 
 def check_memory(grid: GridSpec, class_count: int, limit_gib: float) -> None:
@@ -53,17 +56,25 @@ def check_memory(grid: GridSpec, class_count: int, limit_gib: float) -> None:
     Raises:
         JaxmapError: says what it would take and which voxel size would fit.
     """
-    needed_gib = map_bytes(grid, class_count) / 2**30
-    if needed_gib <= limit_gib:
+    limit_bytes = limit_gib * 2**30
+    needed_bytes = map_bytes(grid, class_count)
+    if needed_bytes <= limit_bytes:
         return
-    size = np.asarray(grid.voxel_size_m, np.float64)
-    # Rounded up to a centimetre: what is advised must fit.
-    fitting = np.ceil(size * (needed_gib / limit_gib) ** (1 / 3) * 100) / 100
-    advice = " ".join(f"{edge:g}" for edge in (fitting[:1] if np.ptp(fitting) == 0 else fitting))
+    size_m = np.asarray(grid.voxel_size_m, np.float64)
+    span_m = size_m * grid.shape
+    # Rounded up to a centimetre, with a voxel to spare along each axis: what is advised must fit.
+    fitting_m = np.ceil(size_m * (needed_bytes / limit_bytes) ** (1 / 3) * 100) / 100
+    while 4 * (1 + class_count) * np.prod(np.ceil(span_m / fitting_m) + 1) > limit_bytes:
+        fitting_m = np.ceil(fitting_m * 1.05 * 100) / 100
+    advice = " ".join(f"{edge:g}" for edge in (fitting_m[:1] if np.ptp(fitting_m) == 0 else fitting_m))
     raise JaxmapError(
-        f"a map of {' x '.join(map(str, grid.shape))} voxels takes {needed_gib:.1f} GiB, "
-        f"over the limit of {limit_gib:g} GiB",
+        f"a map of {' x '.join(map(str, grid.shape))} voxels takes {_size_text(needed_bytes)}, "
+        f"over the limit of {_size_text(limit_bytes)}",
         where="grid",
         fix=f"take larger voxels (--grid.voxel-size-m {advice}), a shorter range (--depth.max-m), "
         "or raise --grid.max-memory-gib",
     )
+
+
+def _size_text(size_bytes: float) -> str:
+    return f"{size_bytes / 2**30:.1f} GiB" if size_bytes >= 2**30 else f"{size_bytes / 2**20:.3g} MiB"

@@ -73,7 +73,7 @@ class StereoFrontEnd:
         matched_s = time.perf_counter()
         return RectifiedFrame(left, right, disparity_px, rectified_s - started_s, matched_s - rectified_s)
 
-    def check_order(self, frame: RectifiedFrame) -> None:
+    def check_order(self, frame: RectifiedFrame, where: object = "") -> None:
         """Refuses pairs whose left and right images are swapped.
 
         Raises:
@@ -83,6 +83,7 @@ class StereoFrontEnd:
             valid = np.isfinite(frame.disparity_px).mean()
             raise JaxmapError(
                 f"left and right look swapped: {valid:.0%} of the disparities are valid, far more the other way round",
+                where=where,
                 fix="swap the two folders or cameras",
             )
 

@@ -28,8 +28,8 @@ class StereoOptions:
     """Penalty for a disparity step of one; by default 8 block_size^2."""
     p2: Annotated[int, Gt(0)] | None = None
     """Penalty for a greater step; by default 32 block_size^2."""
-    pre_filter_cap: Annotated[int, Interval(ge=1, le=63)] = 31
-    """Truncation of the image gradient."""
+    pre_filter_cap: Annotated[int, Interval(ge=15, le=63)] = 31
+    """Truncation of the image gradient; OpenCV takes 15 at least."""
     uniqueness_ratio: Annotated[int, Interval(ge=0, le=100)] = 10
     """Margin in per cent by which the best match must win."""
     left_right_max_diff_px: Annotated[int, Ge(-1)] = 1

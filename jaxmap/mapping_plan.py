@@ -1,0 +1,161 @@
+"""A mapping run, decided in full before the first frame: what is read, its range, bounds and step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from jaxmap.config import MapConfig, split_fusion
+from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
+from jaxmap.datasets.label_files import LabelFolder, open_label_folder
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
+from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
+from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.types import GridSpec, make_grid
+
+Tell = Callable[[str], None]
+
+_KEY_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run, decided in full before the first frame is fused."""
+
+    sequence: StereoSequence
+    front_end: StereoFrontEnd
+    labeller: Labeller
+    label_folder: LabelFolder | None
+    grid: GridSpec
+    depth_range_m: tuple[float, float]
+    rule: FusionRule
+    params: MapperParams
+    fusion: dict[str, Any]
+    mapper: Mapper
+    key: PRNGKeyArray
+
+    @property
+    def key_frames(self) -> set[int]:
+        """Indices of the frames whose pictures are kept."""
+        return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
+
+
+def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
+    """Opens the sequence and decides range, bounds, labeller and step.
+
+    Args:
+        source: the folder of one sequence, or `sample:NAME`.
+        config: the settings.
+        tell: takes lines for the user.
+
+    Raises:
+        JaxmapError: the data or the settings do not serve.
+    """
+    options = ReadOptions(
+        dataset=config.dataset,
+        poses=config.poses,
+        poses_world=config.poses_world,
+        calibration=config.calibration,
+        start=config.start,
+        stop=config.stop,
+        stride=config.stride,
+        max_pose_gap_s=config.max_pose_gap_s,
+    )
+    sequence = open_sequence(source, options)
+    front_end = StereoFrontEnd(sequence.camera, config.stereo)
+    camera = front_end.camera
+    tell(
+        f"{sequence.name} ({sequence.dataset}): {len(sequence.frames)} frames "
+        f"of {camera.width_px} x {camera.height_px} px, f {float(camera.fx_px):.2f} px, "
+        f"baseline {float(camera.baseline_m):.5f} m"
+    )
+    for note in sequence.notes:
+        tell(f"note: {note}")
+
+    max_depth_m = config.depth.max_m or usable_depth(camera, config.depth.max_sigma_m, config.fusion.disparity_sigma_px)
+    if not config.depth.min_m < max_depth_m:
+        raise UsageError(
+            f"depth.min_m {config.depth.min_m} is not below the greatest depth, {max_depth_m} m",
+            fix="set --depth.max-m",
+        )
+    depth_range_m = (config.depth.min_m, max_depth_m)
+    label_folder = _label_folder(config, sequence)
+    with _as_usage_error():
+        labeller = _labeller(config, label_folder)
+        grid = _grid(config, sequence, front_end, max_depth_m)
+        params, rule = split_fusion(config.fusion, labeller.classes)
+        fusion_rule = FusionRule(**rule)
+        mapper_params = MapperParams(camera, make_fusion_params(labeller.classes, **params))
+    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
+    tell(
+        f"depth {depth_range_m[0]:g} to {max_depth_m:g} m; grid {' x '.join(map(str, grid.shape))} voxels of {size} m, "
+        f"{1 + len(labeller.classes)} channels: {map_bytes(grid, len(labeller.classes)) / 2**20:.0f} MiB"
+    )
+    check_memory(grid, len(labeller.classes), config.grid.max_memory_gib)
+
+    return Plan(
+        sequence=sequence,
+        front_end=front_end,
+        labeller=labeller,
+        label_folder=label_folder,
+        grid=grid,
+        depth_range_m=depth_range_m,
+        rule=fusion_rule,
+        params=mapper_params,
+        fusion={"params": params, "rule": rule},
+        mapper=make_mapper(camera, grid, labeller, fusion_rule, depth_range_m),
+        key=jax.random.key(config.seed),
+    )
+
+
+@contextmanager
+def _as_usage_error() -> Iterator[None]:
+    """What is refused while settings are taken up is the fault of the settings."""
+    try:
+        yield
+    except UsageError:
+        raise
+    except JaxmapError as error:
+        raise UsageError(error.what, where=error.where, fix=error.fix or "see jaxmap map --help") from error
+
+
+def _label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFolder | None:
+    if config.labeller != "files":
+        return None
+    if config.labels is None:
+        raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
+    return open_label_folder(config.labels, len(config.classes), config.labels_are, sequence.frames[0].name)
+
+
+def _labeller(config: MapConfig, label_folder: LabelFolder | None) -> Labeller:
+    if len(set(config.classes)) < len(config.classes):
+        raise UsageError(f"a class is named twice: {' '.join(config.classes)}", fix="give each class once")
+    if label_folder is not None:
+        return make_files_labeller(config.classes, soft=label_folder.soft)
+    if config.labeller == "plane":
+        return make_plane_labeller(config.classes, **asdict(config.plane))
+    return make_no_labeller()
+
+
+def _grid(config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float) -> GridSpec:
+    settings = config.grid
+    if (settings.lower_m is None) != (settings.upper_m is None):
+        raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
+    if settings.lower_m is not None and settings.upper_m is not None:
+        return make_grid(settings.lower_m, settings.upper_m, settings.voxel_size_m)
+    return grid_around_views(
+        front_end.camera,
+        sequence.T_world_camera @ front_end.T_raw_rectified,
+        max_depth_m,
+        settings.voxel_size_m,
+        (settings.below_camera_m, settings.above_camera_m),
+    )
