@@ -69,7 +69,7 @@ def _reason(fault: Exception) -> str:
     return " ".join(str(fault).split())[:120]
 
 
-def shortened(items: list[str], at_most: int = 6) -> str:
+def shortened(items: list[str], at_most: int = 3) -> str:
     """The first of them, and how many more there are."""
     more = f" and {len(items) - at_most} more" if len(items) > at_most else ""
     return ", ".join(items[:at_most]) + more
