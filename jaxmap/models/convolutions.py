@@ -6,7 +6,9 @@ shifted slices, and a 1x1 convolution takes twice as long as the same matrix pro
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -84,55 +86,68 @@ def max_pool(
     return largest
 
 
-def _windows(images: Array, size: int, stride: int, dilation: int, padding: Padding, fill: float):
-    """Row, column and the pixels that a kernel's element there meets, for every element that meets any."""
-    height, width = images.shape[1:3]
-    before_y, after_y = pad_amounts(height, size, stride, dilation, padding)
-    before_x, after_x = pad_amounts(width, size, stride, dilation, padding)
-    padded = jnp.pad(images, ((0, 0), (before_y, after_y), (before_x, after_x), (0, 0)), constant_values=fill)
+def _windows(
+    images: Array, size: int, stride: int, dilation: int, padding: Padding, fill: float
+) -> Iterator[tuple[int, int, Array]]:
+    """Row and column of each element of a kernel, and the pixels that it meets.
+
+    Elements that meet nothing but padding are left out, and nothing is padded for them: at a dilation
+    as large as the image (36 on 32x32 features) only the middle one is left.
+    """
+    rows = _Axis.of(images.shape[1], size, stride, dilation, padding)
+    columns = _Axis.of(images.shape[2], size, stride, dilation, padding)
+    padded = jnp.pad(images, ((0, 0), rows.pad, columns.pad, (0, 0)), constant_values=fill)
     # Without the barrier XLA computes the padding anew for each of the slices.
     padded = jax.lax.optimization_barrier(padded)
-    rows = (height + before_y + after_y - dilation * (size - 1) - 1) // stride + 1
-    columns = (width + before_x + after_x - dilation * (size - 1) - 1) // stride + 1
-    for row in range(size):
-        for column in range(size):
-            top, left = row * dilation, column * dilation
-            yield (
-                row,
-                column,
-                padded[
-                    :,
-                    top : top + (rows - 1) * stride + 1 : stride,
-                    left : left + (columns - 1) * stride + 1 : stride,
-                ],
-            )
+    for row, vertical in rows.taps:
+        for column, horizontal in columns.taps:
+            yield row, column, padded[:, vertical, horizontal]
+
+
+class _Axis(NamedTuple):
+    """How a kernel slides along one axis: the padding needed, and the slice that each element meets."""
+
+    pad: tuple[int, int]
+    taps: list[tuple[int, slice]]
+
+    @classmethod
+    def of(cls, size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> _Axis:
+        before, after = pad_amounts(size, kernel, stride, dilation, padding)
+        count = (size + before + after - dilation * (kernel - 1) - 1) // stride + 1
+        firsts = {index: index * dilation - before for index in range(kernel)}
+        span = (count - 1) * stride
+        firsts = {index: first for index, first in firsts.items() if first < size and first + span >= 0}
+        start = max(0, -min(firsts.values()))
+        end = max(0, max(firsts.values()) + span - (size - 1))
+        taps = [(index, slice(first + start, first + start + span + 1, stride)) for index, first in firsts.items()]
+        return cls((start, end), taps)
 
 
 @cache
-def _resize_matrix(source: int, target: int, align_corners: bool) -> np.ndarray:
-    """float32 (target, source): rows of bilinear weights along one axis."""
+def _resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each target pixel along an axis: the source pixels before and after it, and the share of the latter."""
     index = np.arange(target, dtype=np.float64)
     if align_corners:
-        position = index * ((source - 1) / (target - 1)) if target > 1 else np.zeros(1)
+        position = index * ((source - 1) / max(target - 1, 1))
     else:
         position = ((index + 0.5) * (source / target) - 0.5).clip(0, source - 1)
-    low = np.minimum(np.floor(position).astype(int), source - 1)
-    high = np.minimum(low + 1, source - 1)
-    matrix = np.zeros((target, source))
-    np.add.at(matrix, (np.arange(target), low), 1 - (position - low))
-    np.add.at(matrix, (np.arange(target), high), position - low)
-    return matrix.astype(np.float32)
+    low = np.minimum(np.floor(position).astype(np.int32), source - 1)
+    return low, np.minimum(low + 1, source - 1), (position - low).astype(np.float32)
+
+
+def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> Array:
+    source = images.shape[axis]
+    if source == target:
+        return images
+    low, high, share = _resize_taps(source, target, align_corners)
+    shares = share.reshape([-1 if place == axis else 1 for place in range(4)])
+    # Two taps a pixel: five times faster than a product with the matrix of weights.
+    before = jnp.take(images, low, axis=axis, mode="clip")
+    return before + (jnp.take(images, high, axis=axis, mode="clip") - before) * shares
 
 
 def resize_bilinear(
     images: Float[Array, "B H W C"], height: int, width: int, *, align_corners: bool
 ) -> Float[Array, "B h w C"]:
     """Bilinear resizing without antialiasing, as torch and TensorFlow do it."""
-    if images.shape[1:3] == (height, width):
-        return images
-    if images.shape[1:3] == (1, 1):
-        return jnp.broadcast_to(images, (images.shape[0], height, width, images.shape[3]))
-    rows = jnp.asarray(_resize_matrix(images.shape[1], height, align_corners))
-    columns = jnp.asarray(_resize_matrix(images.shape[2], width, align_corners))
-    images = jnp.einsum("yh,bhwc->bywc", rows, images, precision=PRECISION)
-    return jnp.einsum("xw,bywc->byxc", columns, images, precision=PRECISION)
+    return _resize_axis(_resize_axis(images, height, 1, align_corners), width, 2, align_corners)

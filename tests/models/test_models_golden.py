@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from golden.seeded_weights import seeded_image, seeded_state
+from safetensors.numpy import save_file
 
 from jaxmap.models.deeplab import fold_batch_norm, pure_network
 from jaxmap.models.importers import import_weights
@@ -24,14 +25,17 @@ ALL = [
 ]
 
 
-def seeded_checkpoint(backbone: str, path: Path) -> Path:
-    """A checkpoint of segmentation_models_pytorch's form with seeded weights."""
-    from safetensors.numpy import save_file
-
+def seeded_state_of(backbone: str) -> dict[str, np.ndarray]:
+    """A state dict of segmentation_models_pytorch's form with seeded weights."""
     with np.load(GOLDEN) as golden:
         lines = str(golden[f"names/{backbone}"]).splitlines()
     shapes = {name: tuple(ast.literal_eval(shape)) for name, _, shape in (line.partition(" ") for line in lines)}
-    save_file(seeded_state(shapes), path)
+    return seeded_state(shapes)
+
+
+def seeded_checkpoint(backbone: str, path: Path) -> Path:
+    """The same as a file."""
+    save_file(seeded_state_of(backbone), path)
     return path
 
 
