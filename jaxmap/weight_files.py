@@ -93,7 +93,7 @@ def fetch(name: str, *, mirror: str | None = None, tell: Callable[[str], None] =
             known_hash=f"sha256:{public.sha256}" if len(public.sha256) == 64 else None,
             fname=file_name,
             path=folder,
-            downloader=pooch.HTTPDownloader(timeout=TIMEOUT_S),
+            downloader=pooch.HTTPDownloader(timeout=TIMEOUT_S),  # type: ignore[arg-type]
         )
     except Exception as fault:
         reason = " ".join(str(fault).split())[:120] or type(fault).__name__

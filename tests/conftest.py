@@ -10,7 +10,19 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 # `jaxmap.types` stays out: JAX rebuilds its dataclasses with stacked arrays and placeholders for leaves.
-CHECKED_MODULES = ("fusion", "geometry", "labellers", "labels", "mapper", "stereo")
+# Of the networks `deeplab` stays out for the same reason: shapes without arrays go through it.
+CHECKED_MODULES = (
+    *("fusion", "geometry", "labellers", "labels", "mapper", "stereo"),
+    *(
+        "models.convolutions",
+        "models.heads",
+        "models.layers",
+        "models.mobilenet_v2",
+        "models.resnet",
+        "models.xception",
+    ),
+    "evaluation.segmentation_scores",
+)
 # A float annotation takes an int, as PEP 484 has it.
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 install_import_hook([f"jaxmap.{name}" for name in CHECKED_MODULES], CHECKER)

@@ -110,5 +110,5 @@ def check_mask(truth: np.ndarray, size: tuple[int, ...], class_count: int, where
         )
 
 
-def _quotient(above: float, below: float) -> float | None:
+def _quotient(above: float | np.number, below: float | np.number) -> float | None:
     return float(above / below) if below else None

@@ -11,8 +11,6 @@ from jaxmap.models.architecture import Architecture
 from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.layers import ConvBlock, SeparableBlock
 
-Features = Float[Array, "B H W C"]
-
 
 def _separable(inputs: int, record: Architecture, dilation: int = 1) -> SeparableBlock:
     return SeparableBlock(
@@ -45,7 +43,9 @@ class Aspp(nnx.Module):
         self.refine = _separable(channels, record) if record.aspp_conv else None
         self.pool_first, self.dropout = record.pool_first, record.dropout
 
-    def __call__(self, features: Features, dropout_key: PRNGKeyArray | None = None) -> Features:
+    def __call__(
+        self, features: Float[Array, "B H W I"], dropout_key: PRNGKeyArray | None = None
+    ) -> Float[Array, "B H W C"]:
         """Applies the pyramid; features are dropped only where a key is given."""
         pooled = self.pool(features.mean(axis=(1, 2), keepdims=True))
         pooled = jnp.broadcast_to(pooled, (*features.shape[:3], pooled.shape[3]))
@@ -69,7 +69,9 @@ class Decoder(nnx.Module):
         )
         self.align_corners = record.align_corners
 
-    def __call__(self, features: Features, low_level: Features) -> Features:
+    def __call__(
+        self, features: Float[Array, "B h w C"], low_level: Float[Array, "B H W L"]
+    ) -> Float[Array, "B H W C"]:
         """Applies the decoder; the result has the size of `low_level`."""
         low_level = self.reduce(low_level)
         features = resize_bilinear(features, *low_level.shape[1:3], align_corners=self.align_corners)

@@ -37,6 +37,7 @@ def test_same_padding_is_the_library_s(height, width, stride, dilation, size, de
     draw = np.random.default_rng(0)
     images = draw.normal(size=(2, height, width, 4)).astype(np.float32)
     kernel = draw.normal(size=(size, size, 1 if depthwise else 4, 4)).astype(np.float32)
+    images, kernel = jnp.asarray(images), jnp.asarray(kernel)
     ours = convolve(images, kernel, stride=stride, dilation=dilation, padding="same", depthwise=depthwise)
     theirs = library_convolve(images, kernel, stride, dilation, "SAME", 4 if depthwise else 1)
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
@@ -48,6 +49,7 @@ def test_torch_padding_is_the_same_on_both_sides(stride, dilation, depthwise):
     draw = np.random.default_rng(0)
     images = draw.normal(size=(1, 8, 11, 3)).astype(np.float32)
     kernel = draw.normal(size=(3, 3, 1 if depthwise else 3, 3)).astype(np.float32)
+    images, kernel = jnp.asarray(images), jnp.asarray(kernel)
     ours = convolve(images, kernel, stride=stride, dilation=dilation, depthwise=depthwise)
     both = [(dilation, dilation)] * 2
     np.testing.assert_allclose(

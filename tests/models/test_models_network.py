@@ -119,13 +119,13 @@ def test_tensorflow_sizes_are_a_multiple_and_one():
 )
 def test_gradients_equal_finite_differences(make):
     images = np.random.default_rng(0).normal(size=(1, 9, 8, 4))
-    check_gradient(make, lambda model: model(images))
+    check_gradient(make, lambda model: model(jnp.asarray(images)))
 
 
 def test_gradients_of_the_decoder_equal_finite_differences():
     draw = np.random.default_rng(0)
     coarse, fine = draw.normal(size=(1, 3, 4, 8)), draw.normal(size=(1, 6, 8, 4))
-    check_gradient(lambda: Decoder(4, SMALL), lambda model: model(coarse, fine))
+    check_gradient(lambda: Decoder(4, SMALL), lambda model: model(jnp.asarray(coarse), jnp.asarray(fine)))
 
 
 def check_gradient(make, call):
