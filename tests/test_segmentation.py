@@ -12,12 +12,14 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 from fixtures import cli, shared_cache  # noqa: F401
-from golden.seeded_weights import seeded_image, seeded_weights
+from golden.seeded_weights import exported, seeded_image, seeded_weights
 from PIL import Image
+from safetensors.numpy import save_file
 
 from jaxmap import weight_files
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import load_model, save_model
 
@@ -136,13 +138,7 @@ def test_weights_are_fetched_checked_and_kept(cli, server, tmp_path, monkeypatch
     pytest.importorskip("pooch")
     monkeypatch.setenv("JAXMAP_CACHE", str(tmp_path / "cache"))
     folder, url = server
-    from test_models_importers import exported
-
-    from jaxmap.models import import_tables as tables
-
     architecture = torch_architecture("resnet18", ("background", "sand", "rock"))
-    from safetensors.numpy import save_file
-
     source = folder / "resnet18.safetensors"
     save_file(exported(architecture, list(tables.torchvision_backbone("resnet18")), tables.TORCH), source)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()

@@ -56,3 +56,17 @@ def seeded_weights(architecture) -> dict[str, np.ndarray]:
         return seeded_tensor(name.replace(".norm.mean", ".running_mean").replace(".norm.var", ".running_var"), shape)
 
     return {name: tensor(name, shape) for name, shape in weight_shapes(architecture).items()}
+
+
+def exported(architecture, rows, naming) -> dict[str, np.ndarray]:
+    """Seeded weights of ours as the source would name and lay them out."""
+    weights, result = seeded_weights(architecture), {}
+    back = np.argsort(naming.transpose)
+    for row in rows:
+        result[row.convolution + naming.kernel] = np.ascontiguousarray(weights[f"{row.block}.kernel"].transpose(back))
+        if f"{row.block}.bias" in weights:
+            result[row.convolution + naming.bias] = weights[f"{row.block}.bias"]
+        for leaf, suffix in naming.norm.items() if row.norm else ():
+            result[row.norm + suffix] = weights[f"{row.block}.norm.{leaf}"]
+            result[f"{row.norm}.num_batches_tracked"] = np.zeros((), np.int64)
+    return result

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from golden.seeded_weights import seeded_weights
+from golden.seeded_weights import exported, seeded_weights
 from safetensors.numpy import save_file
 
 from jaxmap.errors import JaxmapError
@@ -14,20 +14,6 @@ from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
 from jaxmap.models.deeplab import weight_shapes
 from jaxmap.models.importers import VOC_CLASSES, import_weights
-
-
-def exported(architecture: Architecture, rows: list[tables.Row], naming: tables.Naming) -> dict[str, np.ndarray]:
-    """Seeded weights of ours as the source would name and lay them out."""
-    weights, result = seeded_weights(architecture), {}
-    back = np.argsort(naming.transpose)
-    for row in rows:
-        result[row.convolution + naming.kernel] = np.ascontiguousarray(weights[f"{row.block}.kernel"].transpose(back))
-        if f"{row.block}.bias" in weights:
-            result[row.convolution + naming.bias] = weights[f"{row.block}.bias"]
-        for leaf, suffix in naming.norm.items() if row.norm else ():
-            result[row.norm + suffix] = weights[f"{row.block}.norm.{leaf}"]
-            result[f"{row.norm}.num_batches_tracked"] = np.zeros((), np.int64)
-    return result
 
 
 def same(ours: dict[str, np.ndarray], architecture: Architecture, holds: str) -> bool:
