@@ -9,9 +9,22 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-# `types` and `fusion.params` stay out: JAX rebuilds dataclasses with stacked arrays and placeholders for leaves.
+# `types`, `fusion.params` and `models.deeplab` stay out: JAX rebuilds their dataclasses with stacked arrays,
+# placeholders for leaves, and shapes without arrays.
 FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model")
-CHECKED_MODULES = (*FUSION_MODULES, "geometry", "labellers", "labels", "mapper", "stereo")
+NETWORK_MODULES = tuple(
+    f"models.{name}" for name in ("convolutions", "heads", "layers", "mobilenet_v2", "resnet", "xception")
+)
+CHECKED_MODULES = (
+    *FUSION_MODULES,
+    *NETWORK_MODULES,
+    "evaluation.segmentation_scores",
+    "geometry",
+    "labellers",
+    "labels",
+    "mapper",
+    "stereo",
+)
 # A float annotation takes an int, as PEP 484 has it.
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 install_import_hook([f"jaxmap.{name}" for name in CHECKED_MODULES], CHECKER)

@@ -44,6 +44,8 @@ FLOORS = {
     "jaxmap.run_outputs": 7,
     "jaxmap.mapping": 7,
     "jaxmap.mapping_plan": 7,
+    "jaxmap.segmentation": 7,
+    "jaxmap.weight_files": 7,
     # 8: the command line
     "jaxmap.commands": 8,
     "jaxmap.cli": 8,

@@ -76,24 +76,30 @@ class Console:
     @contextmanager
     def progress(self, title: str, total: int) -> Iterator[Callable[[object], None]]:
         """Shows progress over `total` frames; yields what is to be called after each."""
+        with self.steps(title, "frames", total) as advance:
+            yield lambda fused: advance(fused.prepared.index + 1)  # type: ignore[attr-defined]
+
+    @contextmanager
+    def steps(self, title: str, unit: str, total: int) -> Iterator[Callable[[int], None]]:
+        """Shows progress over `total` of `unit`; yields what is to be called with the number done."""
         if not self._rich.is_terminal:
-            yield self._plain_progress(title, total)
+            yield self._plain_steps(title, unit, total)
             return
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=self._rich, transient=True) as bar:
             task = bar.add_task(title, total=total)
-            yield lambda fused: bar.update(task, completed=fused.prepared.index + 1)  # type: ignore[attr-defined]
+            yield lambda done: bar.update(task, completed=done)
 
-    def _plain_progress(self, title: str, total: int) -> Callable[[object], None]:
+    def _plain_steps(self, title: str, unit: str, total: int) -> Callable[[int], None]:
         told_s = time.monotonic()
 
-        def advance(fused: object) -> None:
+        def advance(done: int) -> None:
             nonlocal told_s
             if time.monotonic() - told_s > 10:
                 told_s = time.monotonic()
-                print(f"{title}: {fused.prepared.index + 1} of {total} frames", file=sys.stderr)  # type: ignore[attr-defined]
+                print(f"{title}: {done} of {total} {unit}", file=sys.stderr)
 
         return advance
 

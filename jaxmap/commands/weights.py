@@ -1,0 +1,90 @@
+"""`jaxmap weights import` and `jaxmap weights fetch`: pretrained networks as model files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from jaxmap.commands.console import Console, parse
+from jaxmap.errors import UsageError
+
+USAGE = """usage: jaxmap weights {import,fetch} [OPTIONS]
+
+  import SRC --out F    convert a public checkpoint to a model file
+  fetch NAME --out F    download public ImageNet weights and convert them
+
+jaxmap weights import --help and jaxmap weights fetch --help say more."""
+
+
+@dataclass(frozen=True)
+class ImportArguments:
+    """Convert a public checkpoint to a model file.
+
+    Known are segmentation_models_pytorch's DeepLabV3Plus, torchvision's and timm's ResNet-18, 50, 101
+    and MobileNetV2, and TensorFlow's folded MobileNetV2 and DeepLabv3. Files are .safetensors, or .pth
+    as PyTorch has written it since 1.6; nothing in them is executed.
+    """
+
+    source: tyro.conf.Positional[Path]
+    """The checkpoint."""
+    out: Path
+    """The .safetensors file to write."""
+    classes: tuple[str, ...] | None = None
+    """Names of its classes, in order."""
+    output_stride: Literal[16, 8] = 16
+    """The stride to run the network at; checkpoints do not tell."""
+
+
+@dataclass(frozen=True)
+class FetchArguments:
+    """Download public ImageNet weights into the cache and convert them to a model file.
+
+    The file is checked by its SHA-256. A backbone is a start for training, not a network that labels.
+    """
+
+    name: tyro.conf.Positional[str]
+    """mobilenet_v2, resnet18, resnet50, resnet101, or _v2 behind the name for torchvision's second weights."""
+    out: Path
+    """The .safetensors file to write."""
+    mirror: str | None = None
+    """URL of a folder that holds the publisher's files under their own names."""
+    classes: tuple[str, ...] | None = None
+    """Names of the classes to train for."""
+    output_stride: Literal[16, 8] = 16
+    """The stride to run the network at."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    if not words or words[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0 if words else 2
+    if words[0] == "import":
+        return _import(parse(ImportArguments, "weights import", words[1:]))
+    if words[0] == "fetch":
+        return _fetch(parse(FetchArguments, "weights fetch", words[1:]))
+    raise UsageError(f"there is no {words[0]!r}", where="jaxmap weights", fix="choose import or fetch")
+
+
+def _import(arguments: ImportArguments) -> int:
+    return _convert(arguments.source, arguments)
+
+
+def _fetch(arguments: FetchArguments) -> int:
+    from jaxmap.weight_files import fetch
+
+    return _convert(fetch(arguments.name, mirror=arguments.mirror, tell=Console().tell), arguments)
+
+
+def _convert(source: Path, arguments: ImportArguments | FetchArguments) -> int:
+    from jaxmap.weight_files import convert_file
+
+    imported = convert_file(source, arguments.out, classes=arguments.classes, output_stride=arguments.output_stride)
+    count = sum(array.size for array in imported.weights.values())
+    Console().tell(f"{imported.source}: {len(imported.weights)} arrays, {count / 1e6:.1f} million numbers")
+    print(f"wrote {arguments.out}")
+    return 0

@@ -1,0 +1,1 @@
+"""Segmentation networks: DeepLabv3 and DeepLabv3+ in Flax NNX, and their files."""

@@ -1,0 +1,182 @@
+"""Model files: one `.safetensors` that says what network its weights belong to.
+
+The metadata key `jaxmap` holds JSON: `format_version`, `architecture` (the fields of `Architecture`),
+`classes`, `normalisation` and `holds` (`network`, or `backbone` where the rest is still to be trained).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from jaxmap.errors import JaxmapError
+from jaxmap.files import atomic_path
+from jaxmap.models.architecture import Architecture, check_architecture
+from jaxmap.models.deeplab import Weights, weight_shapes
+from jaxmap.models.tensor_files import read_safetensors, shortened
+
+FORMAT_VERSION = 1
+
+Holds = Literal["network", "backbone"]
+
+_ELSEWHERE = {"classes", "mean", "std"}
+"""Fields of `Architecture` that stand beside it in the file, where other programs look for them."""
+
+
+class SavedModel(NamedTuple):
+    """What a model file holds.
+
+    Attributes:
+        architecture: the network.
+        weights: its arrays by dotted path, float32.
+        holds: `network`, or `backbone` where only the weights `backbone.*` are there.
+    """
+
+    architecture: Architecture
+    weights: Weights
+    holds: Holds
+
+
+def save_model(
+    path: Path, architecture: Architecture, weights: Mapping[str, object], *, holds: Holds = "network"
+) -> None:
+    """Writes a model file atomically.
+
+    Raises:
+        JaxmapError: the weights are not those of the architecture, or writing failed.
+    """
+    from safetensors.numpy import save_file
+
+    arrays = {name: np.ascontiguousarray(np.asarray(value, np.float32)) for name, value in weights.items()}
+    check_weights(architecture, arrays, holds=holds, where=path)
+    fields = dataclasses.asdict(architecture)
+    record = {
+        "format_version": FORMAT_VERSION,
+        "holds": holds,
+        "architecture": {name: value for name, value in fields.items() if name not in _ELSEWHERE},
+        "classes": list(architecture.classes),
+        "normalisation": {"mean": list(architecture.mean), "std": list(architecture.std), "scale": "0 to 1, RGB"},
+    }
+    with atomic_path(path) as temporary:
+        save_file(arrays, temporary, metadata={"jaxmap": json.dumps(record)})
+
+
+def load_model(path: Path) -> SavedModel:
+    """Reads a model file.
+
+    Raises:
+        JaxmapError: the file is missing, truncated, no model of jaxmap's, of a newer format, or its
+            weights do not fit its architecture.
+    """
+    metadata, tensors = read_safetensors(path)
+    architecture, holds = _read_record(metadata, path)
+    check_weights(architecture, tensors, holds=holds, where=path)
+    return SavedModel(architecture, {name: jnp.asarray(value, jnp.float32) for name, value in tensors.items()}, holds)
+
+
+def load_network(path: Path) -> SavedModel:
+    """Reads a model file that must hold a whole network.
+
+    Raises:
+        JaxmapError: as `load_model`, or there is only a backbone.
+    """
+    saved = load_model(path)
+    if saved.holds != "network":
+        raise JaxmapError(
+            f"the file holds only a backbone ({saved.architecture.backbone})", where=path, fix="train a network from it"
+        )
+    return saved
+
+
+def check_weights(
+    architecture: Architecture, weights: Mapping[str, np.ndarray], *, holds: Holds = "network", where: object
+) -> None:
+    """Compares weights with what an architecture needs.
+
+    Raises:
+        JaxmapError: weights are missing, left over, misshapen or not finite; all are told together.
+    """
+    expected = weight_shapes(architecture)
+    if holds == "backbone":
+        expected = {name: shape for name, shape in expected.items() if name.startswith("backbone.")}
+    misshapen = [
+        f"{name} is {list(weights[name].shape)}, not {list(shape)}"
+        for name, shape in expected.items()
+        if name in weights and tuple(weights[name].shape) != shape
+    ]
+    raise_mismatch(
+        missing=[name for name in expected if name not in weights],
+        left_over=[name for name in weights if name not in expected],
+        misshapen=misshapen,
+        not_finite=[name for name, value in weights.items() if not np.isfinite(value).all()],
+        what=f"the weights are not those of {architecture.backbone} as described",
+        where=where,
+        fix="take the file and the architecture that belong together",
+    )
+
+
+def raise_mismatch(
+    *,
+    missing: list[str],
+    left_over: list[str],
+    misshapen: list[str],
+    not_finite: list[str],
+    what: str,
+    where: object,
+    fix: str,
+) -> None:
+    """Raises one error that tells all differences, or does nothing where there is none.
+
+    Raises:
+        JaxmapError: a list is not empty.
+    """
+    kinds = {"missing": missing, "left over": left_over, "misshapen": misshapen, "not finite": not_finite}
+    parts = [f"{len(names)} {kind}: {shortened(names)}" for kind, names in kinds.items() if names]
+    if parts:
+        raise JaxmapError(f"{what} ({'; '.join(parts)})", where=where, fix=fix)
+
+
+def _read_record(metadata: dict[str, str], path: Path) -> tuple[Architecture, Holds]:
+    if "jaxmap" not in metadata:
+        raise JaxmapError(
+            "no model of jaxmap's: the metadata has no key jaxmap",
+            where=path,
+            fix="convert other networks with jaxmap weights import",
+        )
+    try:
+        record = json.loads(metadata["jaxmap"])
+        version = record["format_version"]
+        if not isinstance(version, int) or version > FORMAT_VERSION:
+            raise JaxmapError(
+                f"written by a newer jaxmap: format {version}, this one reads {FORMAT_VERSION}",
+                where=path,
+                fix="upgrade jaxmap",
+            )
+        fields = dict(record["architecture"], classes=record["classes"])
+        fields.update((name, record["normalisation"][name]) for name in ("mean", "std"))
+        unknown = sorted(set(fields) - {field.name for field in dataclasses.fields(Architecture)})
+        if unknown:
+            raise ValueError(f"unknown fields {unknown[:6]}")
+        holds = record.get("holds", "network")
+        if holds not in get_args(Holds):
+            raise ValueError(f"holds is {holds!r}")
+        architecture = TypeAdapter(Architecture).validate_python(fields)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as fault:
+        raise JaxmapError(
+            f"the metadata key jaxmap is damaged ({_reason(fault)})", where=path, fix="write the model file anew"
+        ) from fault
+    return check_architecture(architecture, path), holds
+
+
+def _reason(fault: Exception) -> str:
+    if isinstance(fault, ValidationError):
+        first = fault.errors()[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    return f"{type(fault).__name__}: {' '.join(str(fault).split())[:120]}"

@@ -1,0 +1,180 @@
+"""DeepLabv3 and DeepLabv3+ (Chen et al. 2017, 2018): the network, its pure form, batch-norm folding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from types import MappingProxyType
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, UInt8
+
+from jaxmap.models.architecture import Architecture, check_architecture, folded
+from jaxmap.models.convolutions import resize_bilinear
+from jaxmap.models.heads import Aspp, Decoder
+from jaxmap.models.layers import ConvBlock
+from jaxmap.models.mobilenet_v2 import MobileNetV2
+from jaxmap.models.resnet import ResNet
+from jaxmap.models.xception import Xception65
+
+Weights = dict[str, Array]
+"""The arrays of a network by their dotted path, such as `backbone.units.3.expand.kernel`."""
+
+Images = UInt8[Array, "B H W 3"] | Float[Array, "B H W 3"]
+"""RGB, 0 to 255, of any size."""
+
+_BACKBONES: dict[str, Callable[[Architecture], MobileNetV2 | ResNet | Xception65]] = {
+    "mobilenet_v2": MobileNetV2,
+    "resnet18": ResNet,
+    "resnet50": ResNet,
+    "resnet101": ResNet,
+    "xception65": Xception65,
+}
+
+
+class DeepLab(nnx.Module):
+    """A segmentation network, fixed by its `Architecture`."""
+
+    def __init__(self, record: Architecture) -> None:
+        self.record = record
+        self.backbone = _BACKBONES[record.backbone](record)
+        self.aspp = Aspp(self.backbone.channels, record)
+        self.decoder = Decoder(self.backbone.low_level_channels, record) if record.decoder else None
+        self.classifier = ConvBlock(record.head_channels, len(record.classes), norm="bias", activation="none")
+
+    def __call__(self, images: Images, *, dropout_key: PRNGKeyArray | None = None) -> Float[Array, "B H W C"]:
+        """Class logits at the size of the images."""
+        height, width = images.shape[1:3]
+        logits = self.coarse_logits(images, dropout_key=dropout_key)
+        padded = (padded_size(height, self.record), padded_size(width, self.record))
+        with jax.named_scope("upsample"):
+            logits = resize_bilinear(logits, *padded, align_corners=self.record.align_corners)
+        return logits[:, :height, :width]
+
+    def coarse_logits(self, images: Images, *, dropout_key: PRNGKeyArray | None = None) -> Float[Array, "B h w C"]:
+        """Class logits before the last upsampling, over the padded images: at stride 4, or the output stride."""
+        with jax.named_scope("backbone"):
+            features, low_level = self.backbone(normalise(images, self.record))
+        with jax.named_scope("aspp"):
+            features = self.aspp(features, dropout_key)
+        if self.decoder is not None:
+            with jax.named_scope("decoder"):
+                features = self.decoder(features, low_level)
+        return self.classifier(features)
+
+
+def padded_size(size: int, record: Architecture) -> int:
+    """The least size not below `size` that the output stride divides, apart from `size_remainder`."""
+    stride, remainder = record.output_stride, record.size_remainder
+    return max(-(-(size - remainder) // stride), 1) * stride + remainder
+
+
+def normalise(images: Images, record: Architecture) -> Float[Array, "B h w 3"]:
+    """Images on the scale the network was trained on, padded below and to the right with zeros (the mean)."""
+    mean, std = (jnp.asarray(values, jnp.float32) * 255 for values in (record.mean, record.std))
+    scaled = (images.astype(jnp.float32) - mean) / std
+    after = [padded_size(size, record) - size for size in images.shape[1:3]]
+    return jnp.pad(scaled, ((0, 0), (0, after[0]), (0, after[1]), (0, 0)))
+
+
+def make_network(architecture: Architecture, key: PRNGKeyArray) -> DeepLab:
+    """A network with random weights, in evaluation mode.
+
+    Raises:
+        JaxmapError: no such network can be built.
+    """
+    network = nnx.eval_shape(lambda: DeepLab(check_architecture(architecture)))
+    return _filled(network, initial_weights(architecture, key))
+
+
+def initial_weights(architecture: Architecture, key: PRNGKeyArray) -> Weights:
+    """Random weights: kernels by He et al. 2015, norms that do nothing, biases of 0.
+
+    They are drawn on the host, the same on every machine.
+    """
+    draw = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+
+    def array(name: str, shape: tuple[int, ...]) -> Array:
+        if len(shape) == 4:
+            # The variance is kept on the way back through the ReLUs; a depthwise kernel feeds one output.
+            fan = shape[0] * shape[1] * (shape[3] if shape[2] > 1 or shape[0] == 1 else 1)
+            return jnp.asarray(draw.standard_normal(shape, np.float32) * np.float32(np.sqrt(2 / fan)))
+        return jnp.asarray(np.full(shape, name.endswith((".norm.scale", ".norm.var")), np.float32))
+
+    return {name: array(name, shape) for name, shape in weight_shapes(architecture).items()}
+
+
+def _filled(network: DeepLab, weights: Weights) -> DeepLab:
+    """A network with these arrays in the place of its own."""
+    graph, state = nnx.split(network)
+    flat = {path: variable.replace(weights[".".join(map(str, path))]) for path, variable in nnx.to_flat_state(state)}
+    return nnx.merge(graph, nnx.from_flat_state(flat))
+
+
+class PureNetwork(NamedTuple):
+    """A network as a pure function and its weights.
+
+    Attributes:
+        architecture: what it is.
+        weights: its arrays by dotted path; a pytree.
+        apply: `(weights, images) -> logits`, not yet jitted.
+        apply_coarse: the same for `DeepLab.coarse_logits`.
+    """
+
+    architecture: Architecture
+    weights: Weights
+    apply: Callable[[Weights, Images], Float[Array, "B H W C"]]
+    apply_coarse: Callable[[Weights, Images], Float[Array, "B h w C"]]
+
+
+def pure_form(network: DeepLab) -> PureNetwork:
+    """Splits a network once, so that its calls cost no Python when they are jitted."""
+    skeleton = nnx.eval_shape(lambda: DeepLab(network.record))
+
+    def apply(weights: Weights, images: Images) -> Array:
+        return _filled(skeleton, weights)(images)
+
+    def apply_coarse(weights: Weights, images: Images) -> Array:
+        return _filled(skeleton, weights).coarse_logits(images)
+
+    return PureNetwork(network.record, network_weights(network), apply, apply_coarse)
+
+
+def network_weights(network: DeepLab) -> Weights:
+    """The arrays of a network by dotted path."""
+    return {".".join(map(str, path)): variable.get_value() for path, variable in nnx.to_flat_state(nnx.state(network))}
+
+
+@cache
+def weight_shapes(architecture: Architecture) -> Mapping[str, tuple[int, ...]]:
+    """Shape of every weight of a network, by dotted path, without allocating any."""
+    network = nnx.eval_shape(lambda: DeepLab(architecture))
+    return MappingProxyType({name: tuple(leaf.shape) for name, leaf in network_weights(network).items()})
+
+
+def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
+    """The pure form of a network with given weights, which must be complete."""
+    network = nnx.eval_shape(lambda: DeepLab(architecture))
+    arrays = {name: jnp.asarray(value) for name, value in weights.items()}
+    return pure_form(network)._replace(weights=arrays)
+
+
+def fold_batch_norm(architecture: Architecture, weights: Weights) -> tuple[Architecture, Weights]:
+    """The same network without batch norm: its scale and shift go into the convolutions before it.
+
+    `w (x - mean) scale / sqrt(var + eps) + bias` is a convolution of kernel `w scale / sqrt(var + eps)`.
+    """
+    result = {name: value for name, value in weights.items() if ".norm." not in name}
+    for name, mean in weights.items():
+        block, _, leaf = name.rpartition(".norm.")
+        if leaf != "mean":
+            continue
+        eps = architecture.backbone_eps if block.startswith("backbone.") else architecture.head_eps
+        gain = weights[f"{block}.norm.scale"] * jax.lax.rsqrt(weights[f"{block}.norm.var"] + eps)
+        result[f"{block}.kernel"] = weights[f"{block}.kernel"] * gain
+        result[f"{block}.bias"] = weights[f"{block}.norm.bias"] - mean * gain
+    return folded(architecture), result

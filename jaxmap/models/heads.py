@@ -1,0 +1,81 @@
+"""What turns features into logits: atrous spatial pyramid pooling and the decoder (Chen et al. 2018)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxmap.models.architecture import Architecture
+from jaxmap.models.convolutions import resize_bilinear
+from jaxmap.models.layers import ConvBlock, SeparableBlock
+
+
+def _separable(inputs: int, record: Architecture, dilation: int = 1) -> SeparableBlock:
+    return SeparableBlock(
+        inputs,
+        record.head_channels,
+        dilation=dilation,
+        norm="batch" if record.head_norm else "bias",
+        norm_inside=record.norm_inside,
+        eps=record.head_eps,
+    )
+
+
+def _plain(inputs: int, outputs: int, record: Architecture, size: int = 1, dilation: int = 1) -> ConvBlock:
+    norm = "batch" if record.head_norm else "bias"
+    return ConvBlock(inputs, outputs, size, dilation=dilation, norm=norm, eps=record.head_eps)
+
+
+class Aspp(nnx.Module):
+    """Branches that see the features at several scales, side by side, reduced to one depth."""
+
+    def __init__(self, inputs: int, record: Architecture) -> None:
+        channels = record.head_channels
+        self.pool = _plain(inputs, channels, record)
+        self.point = _plain(inputs, channels, record)
+        self.atrous = nnx.List(
+            _separable(inputs, record, rate) if record.separable_aspp else _plain(inputs, channels, record, 3, rate)
+            for rate in record.atrous_rates
+        )
+        self.project = _plain((2 + len(record.atrous_rates)) * channels, channels, record)
+        self.refine = _separable(channels, record) if record.aspp_conv else None
+        self.pool_first, self.dropout = record.pool_first, record.dropout
+
+    def __call__(
+        self, features: Float[Array, "B H W I"], dropout_key: PRNGKeyArray | None = None
+    ) -> Float[Array, "B H W C"]:
+        """Applies the pyramid; features are dropped only where a key is given."""
+        pooled = self.pool(features.mean(axis=(1, 2), keepdims=True))
+        pooled = jnp.broadcast_to(pooled, (*features.shape[:3], pooled.shape[3]))
+        branches = [self.point(features), *(branch(features) for branch in self.atrous)]
+        branches = [pooled, *branches] if self.pool_first else [*branches, pooled]
+        result = self.project(jnp.concatenate(branches, axis=-1))
+        if dropout_key is not None and self.dropout > 0:
+            kept = jax.random.bernoulli(dropout_key, 1 - self.dropout, result.shape)
+            result = jnp.where(kept, result / (1 - self.dropout), 0)
+        return result if self.refine is None else self.refine(result)
+
+
+class Decoder(nnx.Module):
+    """Joins the upsampled features with the low-level ones, at stride 4."""
+
+    def __init__(self, low_level_channels: int, record: Architecture) -> None:
+        self.reduce = _plain(low_level_channels, record.low_level_channels, record)
+        inputs = record.head_channels + record.low_level_channels
+        self.refine = nnx.List(
+            _separable(inputs if index == 0 else record.head_channels, record) for index in range(record.decoder_convs)
+        )
+        self.align_corners = record.align_corners
+
+    def __call__(
+        self, features: Float[Array, "B h w C"], low_level: Float[Array, "B H W L"]
+    ) -> Float[Array, "B H W C"]:
+        """Applies the decoder; the result has the size of `low_level`."""
+        low_level = self.reduce(low_level)
+        features = resize_bilinear(features, *low_level.shape[1:3], align_corners=self.align_corners)
+        features = jnp.concatenate([features, low_level], axis=-1)
+        for block in self.refine:
+            features = block(features)
+        return features

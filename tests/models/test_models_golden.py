@@ -1,0 +1,62 @@
+"""The same numbers as the torch networks: given the same weights and image, the same logits."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from golden.seeded_weights import seeded_image, seeded_state
+from safetensors.numpy import save_file
+
+from jaxmap.models.deeplab import fold_batch_norm, pure_network
+from jaxmap.models.importers import import_weights
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "smp_golden.npz"
+STEP = 3
+QUICK = [("mobilenet_v2", 16, (64, 96)), ("resnet18", 16, (64, 96)), ("resnet50", 16, (64, 96))]
+ALL = [
+    (backbone, stride, size)
+    for backbone in ("mobilenet_v2", "resnet18", "resnet50")
+    for stride in (16, 8)
+    for size in ((64, 96), (96, 128))
+]
+
+
+def seeded_state_of(backbone: str) -> dict[str, np.ndarray]:
+    """A state dict of segmentation_models_pytorch's form with seeded weights."""
+    with np.load(GOLDEN) as golden:
+        lines = str(golden[f"names/{backbone}"]).splitlines()
+    shapes = {name: tuple(ast.literal_eval(shape)) for name, _, shape in (line.partition(" ") for line in lines)}
+    return seeded_state(shapes)
+
+
+def seeded_checkpoint(backbone: str, path: Path) -> Path:
+    """The same as a file."""
+    save_file(seeded_state_of(backbone), path)
+    return path
+
+
+def check(backbone: str, stride: int, size: tuple[int, int], folder: Path) -> None:
+    imported = import_weights(seeded_checkpoint(backbone, folder / "smp.safetensors"), output_stride=stride)
+    architecture, weights = fold_batch_norm(imported.architecture, imported.weights)
+    network = pure_network(architecture, weights)
+    logits = np.asarray(jax.jit(network.apply)(network.weights, seeded_image(*size)[None])[0])
+    key = f"{backbone}_{stride}_{size[0]}x{size[1]}"
+    with np.load(GOLDEN) as golden:
+        expected, labels = golden[f"logits/{key}"], golden[f"labels/{key}"]
+    np.testing.assert_allclose(logits[::STEP, ::STEP], expected, atol=1e-3, rtol=0)
+    assert (logits.argmax(axis=-1) == labels).mean() >= 0.999
+
+
+@pytest.mark.parametrize(("backbone", "stride", "size"), QUICK)
+def test_logits_equal_torch(backbone, stride, size, tmp_path):
+    check(backbone, stride, size, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("backbone", "stride", "size"), [case for case in ALL if case not in QUICK])
+def test_logits_equal_torch_at_other_strides_and_sizes(backbone, stride, size, tmp_path):
+    check(backbone, stride, size, tmp_path)

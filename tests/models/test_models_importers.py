@@ -1,0 +1,112 @@
+"""Every public form of weights is recognised and converted; whatever does not fit is told at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from golden.seeded_weights import exported, seeded_weights
+from safetensors.numpy import save_file
+
+from jaxmap.errors import JaxmapError
+from jaxmap.models import import_tables as tables
+from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
+from jaxmap.models.deeplab import weight_shapes
+from jaxmap.models.importers import VOC_CLASSES, import_weights
+
+
+def same(ours: dict[str, np.ndarray], architecture: Architecture, holds: str) -> bool:
+    expected = seeded_weights(architecture)
+    names = [name for name in expected if holds == "network" or name.startswith("backbone.")]
+    return set(ours) == set(names) and all(np.array_equal(ours[name], expected[name]) for name in names)
+
+
+@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet18", "resnet50", "resnet101"])
+def test_torchvision_backbones(backbone, tmp_path):
+    architecture = torch_architecture(backbone, ("background", "sand", "rock"))
+    source = exported(architecture, list(tables.torchvision_backbone(backbone)), tables.TORCH)
+    source["classifier.1.weight" if backbone == "mobilenet_v2" else "fc.weight"] = np.zeros((10, 4), np.float32)
+    save_file({f"module.{name}": value for name, value in source.items()}, tmp_path / "a.safetensors")
+    imported = import_weights(tmp_path / "a.safetensors")
+    assert imported.architecture == architecture and imported.holds == "backbone"
+    assert same(imported.weights, architecture, "backbone")
+
+
+def test_timm_mobilenet(tmp_path):
+    architecture = torch_architecture("mobilenet_v2", ("background", "sand", "rock"))
+    save_file(exported(architecture, list(tables.timm_mobilenet_v2()), tables.TORCH), tmp_path / "a.safetensors")
+    imported = import_weights(tmp_path / "a.safetensors")
+    assert "timm" in imported.source and same(imported.weights, architecture, "backbone")
+
+
+@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet50"])
+def test_smp_networks(backbone, tmp_path):
+    architecture = torch_architecture(backbone, ("a", "b"), output_stride=8)
+    rows = [*tables.torchvision_backbone(backbone, "encoder."), *tables.smp_head(architecture)]
+    save_file(exported(architecture, rows, tables.TORCH), tmp_path / "a.safetensors")
+    imported = import_weights(tmp_path / "a.safetensors", classes=("a", "b"), output_stride=8)
+    assert imported.architecture == architecture and same(imported.weights, architecture, "network")
+    assert import_weights(tmp_path / "a.safetensors").architecture.classes == ("class_0", "class_1")
+    with pytest.raises(JaxmapError, match="3 classes are named, the network has 2"):
+        import_weights(tmp_path / "a.safetensors", classes=("a", "b", "c"))
+
+
+def test_tensorflow_networks(tmp_path):
+    voc = replace(tf_architecture("mobilenet_v2", VOC_CLASSES, decoder=False), backbone_norm=False, head_norm=False)
+    rows = [*tables.tf_folded_mobilenet_v2(top=False), *tables.tf_folded_head()]
+    save_file(exported(voc, rows, tables.TENSORFLOW), tmp_path / "a.safetensors")
+    imported = import_weights(tmp_path / "a.safetensors")
+    assert imported.architecture == voc and same(imported.weights, voc, "network")
+
+
+def test_names_agree_with_the_published_lists(realdata):
+    folder = realdata / "weights" / "state_dict_names"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    for backbone in ("mobilenet_v2", "resnet18", "resnet50"):
+        architecture = torch_architecture(backbone, ("a", "b", "c"))
+        for prefix, head, file in (
+            ("", [], f"torchvision_{backbone}.txt"),
+            ("encoder.", tables.smp_head(architecture), f"smp060_DeepLabV3Plus_{backbone}.txt"),
+        ):
+            rows = [*tables.torchvision_backbone(backbone, prefix), *head]
+            ours = {name: value.shape for name, value in exported(architecture, rows, tables.TORCH).items()}
+            lines = [line.split("\t") for line in (folder / file).read_text().splitlines()]
+            theirs = {name: shape for name, shape, _ in lines if not name.startswith(("fc.", "classifier."))}
+            assert {name: str(shape) for name, shape in ours.items()} == theirs
+
+
+def test_everything_wrong_is_told_in_one_error(tmp_path):
+    architecture = torch_architecture("resnet18", ("a",))
+    source = exported(architecture, list(tables.torchvision_backbone("resnet18")), tables.TORCH)
+    del source["bn1.running_mean"]
+    source["conv1.weight"] = np.zeros((64, 1, 7, 7), np.float32)
+    source["layer9.weight"] = np.zeros(2, np.float32)
+    save_file(source, tmp_path / "a.safetensors")
+    with pytest.raises(JaxmapError) as caught:
+        import_weights(tmp_path / "a.safetensors")
+    for word in (
+        "missing: bn1.running_mean",
+        "left over: layer9.weight",
+        "conv1.weight gives [7, 7, 1, 64], not [7, 7, 3, 64]",
+    ):
+        assert word in str(caught.value)
+
+
+def test_unknown_networks_are_refused(tmp_path):
+    save_file({"a.weight": np.zeros(3, np.float32)}, tmp_path / "a.safetensors")
+    with pytest.raises(JaxmapError, match="no known kind"):
+        import_weights(tmp_path / "a.safetensors")
+    names = [f"layer{stage}.{unit}.conv1.weight" for stage in (1, 2, 3, 4) for unit in range(3)]
+    save_file({name: np.zeros(1, np.float32) for name in names}, tmp_path / "a.safetensors")
+    with pytest.raises(JaxmapError, match=r"3\+3\+3\+3 basic units"):
+        import_weights(tmp_path / "a.safetensors")
+
+
+def test_tables_name_every_block_once():
+    for backbone in ("mobilenet_v2", "resnet18", "resnet50", "resnet101"):
+        architecture = torch_architecture(backbone, ("a",))
+        rows = [*tables.torchvision_backbone(backbone), *tables.smp_head(architecture)]
+        blocks = {name.rpartition(".")[0].removesuffix(".norm") for name in weight_shapes(architecture)}
+        assert sorted(row.block for row in rows) == sorted(blocks)

@@ -1,0 +1,146 @@
+"""PyTorch's zip files are read without running anything that they hold."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxmap.errors import JaxmapError
+from jaxmap.models.torch_files import read_torch_zip
+
+GOLDEN = Path(__file__).parent.parent / "golden"
+
+
+def write_zip(path: Path, program: bytes, compression: int = zipfile.ZIP_STORED, **members: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr("archive/data.pkl", program)
+        for name, content in members.items():
+            archive.writestr(f"archive/data/{name.removeprefix('s')}", content)
+    return path
+
+
+def tensor_program(
+    shape: tuple[int, ...], strides: tuple[int, ...], count: int, storage: str = "FloatStorage"
+) -> bytes:
+    """A state dict of one tensor `w`, as PyTorch pickles it."""
+
+    def word(text: str) -> bytes:
+        return b"X" + len(text).to_bytes(4, "little") + text.encode()
+
+    def number(value: int) -> bytes:
+        return b"\x8a\x08" + value.to_bytes(8, "little", signed=True)
+
+    def numbers(values: tuple[int, ...]) -> bytes:
+        return b"(" + b"".join(map(number, values)) + b"t"
+
+    reference = (
+        b"(" + word("storage") + f"ctorch\n{storage}\n".encode() + word("0") + word("cpu") + number(count) + b"tQ"
+    )
+    hooks = b"ccollections\nOrderedDict\n)R"
+    tensor = b"ctorch._utils\n_rebuild_tensor_v2\n(" + reference + number(0) + numbers(shape) + numbers(strides)
+    return b"\x80\x02}" + word("w") + tensor + b"\x89" + hooks + b"tRs."
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(JaxmapError) as caught:
+        read_torch_zip(path)
+    assert str(path) in str(caught.value) and ";" in str(caught.value) and len(str(caught.value)) < 500
+    return str(caught.value)
+
+
+def test_what_torch_writes_is_read():
+    tensors = read_torch_zip(GOLDEN / "tiny.pth")
+    base = np.arange(24, dtype=np.float32)
+    assert set(tensors) == {"plain", "turned", "part", "half", "double", "parameter", "empty"}
+    np.testing.assert_array_equal(tensors["plain"], base.reshape(2, 3, 4))
+    np.testing.assert_array_equal(tensors["turned"], base.reshape(4, 6).T)
+    np.testing.assert_array_equal(tensors["part"], base[5:9])
+    np.testing.assert_array_equal(tensors["half"], [0.5, -2])
+    assert tensors["double"] == 1.25 and tensors["double"].shape == ()
+    assert tensors["empty"].shape == (0, 3)
+
+
+def test_a_tensor_by_hand_is_read(tmp_path):
+    path = write_zip(tmp_path / "a.pth", tensor_program((2, 3), (3, 1), 6), s0=np.arange(6, dtype="<f4").tobytes())
+    np.testing.assert_array_equal(read_torch_zip(path)["w"], np.arange(6.0).reshape(2, 3))
+
+
+class Bomb:
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_a_bomb_is_refused_by_name_and_does_not_go_off(tmp_path, protocol):
+    program = pickle.dumps({"state_dict": {"w": Bomb(tmp_path / "gone_off")}}, protocol=protocol)
+    told = refusal(write_zip(tmp_path / "bomb.pth", program))
+    assert "refused" in told
+    assert not (tmp_path / "gone_off").exists()
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        b"cos\nsystem\n(X\x04\x00\x00\x00truetR.",
+        b"cbuiltins\neval\n.",
+        b"(X\x04\x00\x00\x00trueios\nsystem\n.",
+        b"ctorch\nload\n.",
+        b"\x80\x04\x8c\x02os\x8c\x06system\x93.",
+    ],
+)
+def test_other_names_and_instructions_are_refused(tmp_path, program):
+    assert "refused" in refusal(write_zip(tmp_path / "a.pth", program))
+
+
+@pytest.mark.parametrize(
+    ("program", "size"),
+    [
+        (tensor_program((1 << 40,), (1,), 6), 24),
+        (tensor_program((1 << 40,), (0,), 6), 24),
+        (tensor_program((1 << 30, 1 << 34), (0, 0), 6), 24),
+        (tensor_program((2, 3), (3, 1), 1 << 50), 24),
+        (tensor_program((2, 3), (3, 1), 6), 20),
+        (tensor_program((2, 3), (-3, 1), 6), 24),
+        (tensor_program((2, 3), (3,), 6), 24),
+        (tensor_program((2, 3), (3, 1), 6, "StrangeStorage"), 24),
+    ],
+)
+def test_shapes_that_the_file_does_not_hold_are_refused(tmp_path, program, size):
+    refusal(write_zip(tmp_path / "a.pth", program, s0=bytes(size)))
+
+
+def test_compressed_members_are_refused(tmp_path):
+    path = write_zip(
+        tmp_path / "a.pth", tensor_program((1 << 22,), (1,), 1 << 22), zipfile.ZIP_DEFLATED, s0=bytes(1 << 24)
+    )
+    assert "compressed" in refusal(path)
+
+
+def test_the_old_format_says_how_to_convert():
+    assert "safetensors.torch.save_file" in refusal(GOLDEN / "tiny_legacy.pth")
+
+
+def test_a_truncated_file_is_an_error(tmp_path):
+    whole = (GOLDEN / "tiny.pth").read_bytes()
+    for length in (0, 10, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.pth").write_bytes(whole[:length])
+        refusal(tmp_path / "cut.pth")
+
+
+def test_any_damage_is_an_error_or_harmless(tmp_path):
+    whole, draw = bytearray((GOLDEN / "tiny.pth").read_bytes()), np.random.default_rng(0)
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for place in draw.integers(0, len(whole), 4):
+            damaged[place] = draw.integers(256)
+        (tmp_path / "damaged.pth").write_bytes(damaged)
+        with suppress(JaxmapError):
+            read_torch_zip(tmp_path / "damaged.pth")
