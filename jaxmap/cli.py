@@ -19,6 +19,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0; 2 for a wrong command line or configuration; 1 for anything else; 130 when interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
     if not words or words[0] in ("-h", "--help"):
         print(_overview())
         return 0 if words else 2
@@ -28,8 +30,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] not in COMMANDS:
         _say(f"error: there is no command {words[0]!r}; choose one of {', '.join(COMMANDS)}")
         return 2
-    debug = "--debug" in words
-    words = [word for word in words if word != "--debug"]
     try:
         command = importlib.import_module(f"jaxmap.commands.{words[0]}")
         return command.main(words[1:]) or 0
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(f"error: {error}")
         return error.exit_code
     except KeyboardInterrupt:
-        _say("error: interrupted; jaxmap map --resume goes on from the last save")
+        _say("error: interrupted")
         return 130
     except BrokenPipeError:
         # The reader of our output has gone; Python must not complain about it at exit.

@@ -29,7 +29,7 @@ class GridConfig:
     voxel_size_m: Positive | tuple[Positive, Positive, Positive] = 0.1
     """Edge of a voxel, or three edges (x, y, z)."""
     lower_m: Triple | None = None
-    """Lower corner of the map in its world; by default the poses and the range decide."""
+    """Lower corner of the map, relative to the site origin; by default the poses and the range decide."""
     upper_m: Triple | None = None
     """Upper corner, with the lower one."""
     below_camera_m: Positive = 3.0
@@ -142,9 +142,9 @@ class MapConfig:
     labeller: Literal["plane", "files", "none"] = "plane"
     """What labels the points: the MLESAC plane, files of labels, or nothing."""
     labels: Path | None = None
-    """Folder of labels for the files labeller: NAME.png class indices or NAME.npy probabilities."""
-    labels_are: Literal["raw", "rectified"] = "rectified"
-    """On which pixels those labels lie."""
+    """Folder of labels, with the files labeller: NAME.png class indices or NAME.npy probabilities."""
+    labels_are: Literal["auto", "raw", "rectified"] = "auto"
+    """On which pixels those labels lie; it must be said where the images are raw and jaxmap rectifies them."""
     classes: tuple[str, ...] = ("background", "sand", "rock")
     """The classes, in the order of the label indices."""
     poses: Path | None = None
@@ -153,12 +153,14 @@ class MapConfig:
     """World of the poses: z up, camera-like (y down), or find out."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
+    crs: str | None = None
+    """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
     max_pose_gap_s: Positive = 1.0
     """Poses farther apart are not bridged."""
     start: int = 0
     """First frame."""
     stop: int | None = None
-    """Frame to stop before; by default the end."""
+    """Frame to stop before, from the end if negative; by default the end."""
     stride: Annotated[int, Gt(0)] = 1
     """Take every so many frames."""
     strict: bool = False
@@ -203,7 +205,8 @@ def load_config(name_or_path: str) -> MapConfig:
         raise UsageError(f"cannot be read: {error.strerror}", where=path) from error
     if not isinstance(tree or {}, dict):
         raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
-    return check_config(tree or {}, where=path)
+    # The resolved configuration of a run names its sequence; the command line does so here.
+    return check_config({key: value for key, value in (tree or {}).items() if key != "sequence"}, where=path)
 
 
 def check_config(tree: dict[str, Any], where: object = "the command line") -> MapConfig:

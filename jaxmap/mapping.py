@@ -55,20 +55,27 @@ def run_plan(
     saved_s = resumed_s = time.perf_counter()
     frames = prepare_frames(plan.sequence, plan.front_end, plan.label_folder, first=log.next_index)
     run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict)
-    for voxel_map, fused in run:
-        if fused.cost is not None:
-            log.temporary_bytes = fused.cost.temporary_bytes
-            log.compile_s += fused.cost.compile_s
-            # Compiling is told apart from mapping.
-            resumed_s += fused.cost.compile_s
-        log.add(fused)
-        if fused.info is not None and fused.prepared.index in plan.key_frames:
-            _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
-        on_frame(fused)
-        if time.perf_counter() - saved_s > checkpoint_every_s:
-            log.total_s += time.perf_counter() - resumed_s
+    try:
+        for voxel_map, fused in run:
+            if fused.cost is not None:
+                log.temporary_bytes = fused.cost.temporary_bytes
+                log.compile_s += fused.cost.compile_s
+                # Compiling is told apart from mapping.
+                resumed_s += fused.cost.compile_s
+            log.add(fused)
+            if fused.info is not None and fused.prepared.index in plan.key_frames:
+                _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
+            on_frame(fused)
+            if time.perf_counter() - saved_s > checkpoint_every_s:
+                log.total_s += time.perf_counter() - resumed_s
+                save_map(folder.map, voxel_map, _attributes(plan, log))
+                saved_s = resumed_s = time.perf_counter()
+    except KeyboardInterrupt:
+        # Only where map and log speak of the same frames: the interrupt may come between the two.
+        if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == len(log.fused) > 0:
             save_map(folder.map, voxel_map, _attributes(plan, log))
-            saved_s = resumed_s = time.perf_counter()
+            tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
+        raise
     log.total_s += time.perf_counter() - resumed_s
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
@@ -100,9 +107,9 @@ def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
     if saved is None:
         return None
     voxel_map, log = saved
-    done = {*log.fused, *(skipped["frame"] for skipped in log.skipped)}
-    names = [frame.name for frame in plan.sequence.frames]
-    same_frames = done == set(names[: log.next_index]) and (not log.complete or log.next_index == len(names))
+    same_frames = log.next_index <= len(plan.sequence.frames) and log.digest == plan.digest(log.next_index)
+    # A sequence that has grown since goes on where it ended.
+    log.complete = log.complete and log.next_index == len(plan.sequence.frames)
     same_grid = (
         voxel_map.grid.shape == plan.grid.shape
         and voxel_map.classes == plan.labeller.classes
@@ -111,7 +118,7 @@ def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
     )
     if not (same_frames and same_grid):
         raise JaxmapError(
-            f"the {'frames' if same_grid else 'bounds of the map'} are not those that the run was begun with",
+            f"the {'bounds of the map' if same_frames else 'frames, poses or camera'} are not those of the run so far",
             where=folder.path,
             fix="bring the sequence back as it was, or map it anew with --overwrite",
         )
@@ -119,6 +126,7 @@ def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
 
 
 def _attributes(plan: Plan, log: RunLog) -> MapAttributes:
+    log.digest = plan.digest(log.next_index)
     return MapAttributes(
         crs=plan.sequence.crs,
         site_origin=plan.sequence.site_origin,

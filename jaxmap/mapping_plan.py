@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,12 +16,14 @@ from jaxtyping import PRNGKeyArray
 from jaxmap.config import MapConfig, split_fusion
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
+from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
 from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import GridSpec, make_grid
 
 Tell = Callable[[str], None]
@@ -31,6 +35,7 @@ _KEY_FRAMES = 4
 class Plan:
     """A run, decided in full before the first frame is fused."""
 
+    source: str
     sequence: StereoSequence
     front_end: StereoFrontEnd
     labeller: Labeller
@@ -47,6 +52,14 @@ class Plan:
     def key_frames(self) -> set[int]:
         """Indices of the frames whose pictures are kept."""
         return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
+
+    def digest(self, count: int) -> str:
+        """A fingerprint of the first frames, their poses and the camera: what a resumed run must share."""
+        frames = self.sequence.frames[:count]
+        described = [(frame.name, frame.timestamp_s) for frame in frames]
+        camera = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(self.front_end.camera)]
+        poses = np.ascontiguousarray(self.sequence.T_world_camera[:count])
+        return hashlib.sha256(repr((described, camera)).encode() + poses.tobytes()).hexdigest()[:16]
 
 
 def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
@@ -69,6 +82,7 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         stop=config.stop,
         stride=config.stride,
         max_pose_gap_s=config.max_pose_gap_s,
+        crs=config.crs,
     )
     sequence = open_sequence(source, options)
     front_end = StereoFrontEnd(sequence.camera, config.stereo)
@@ -80,6 +94,9 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     )
     for note in sequence.notes:
         tell(f"note: {note}")
+    if sequence.site_origin.any():
+        origin = " ".join(f"{number:.0f}" for number in sequence.site_origin)
+        tell(f"site origin {origin} ({sequence.crs or 'no CRS given: --crs'}); bounds are relative to it")
 
     max_depth_m = config.depth.max_m or usable_depth(camera, config.depth.max_sigma_m, config.fusion.disparity_sigma_px)
     if not config.depth.min_m < max_depth_m:
@@ -103,6 +120,7 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     check_memory(grid, len(labeller.classes), config.grid.max_memory_gib)
 
     return Plan(
+        source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
         sequence=sequence,
         front_end=front_end,
         labeller=labeller,
@@ -130,10 +148,22 @@ def _as_usage_error() -> Iterator[None]:
 
 def _label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFolder | None:
     if config.labeller != "files":
+        if config.labels is not None:
+            raise UsageError(
+                f"--labels is given, but the labeller is {config.labeller}", fix="add --labeller files, or leave it out"
+            )
         return None
     if config.labels is None:
         raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
-    return open_label_folder(config.labels, len(config.classes), config.labels_are, sequence.frames[0].name)
+    labels_are = config.labels_are
+    if labels_are == "auto":
+        if isinstance(sequence.camera, StereoRig):
+            raise UsageError(
+                "the images are raw, and labels may lie on raw or on rectified pixels",
+                fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
+            )
+        labels_are = "rectified"
+    return open_label_folder(config.labels, len(config.classes), labels_are, sequence.frames[0].name)
 
 
 def _labeller(config: MapConfig, label_folder: LabelFolder | None) -> Labeller:
@@ -148,14 +178,30 @@ def _labeller(config: MapConfig, label_folder: LabelFolder | None) -> Labeller:
 
 def _grid(config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float) -> GridSpec:
     settings = config.grid
-    if (settings.lower_m is None) != (settings.upper_m is None):
-        raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
-    if settings.lower_m is not None and settings.upper_m is not None:
-        return make_grid(settings.lower_m, settings.upper_m, settings.voxel_size_m)
-    return grid_around_views(
+    views = grid_around_views(
         front_end.camera,
         sequence.T_world_camera @ front_end.T_raw_rectified,
         max_depth_m,
         settings.voxel_size_m,
         (settings.below_camera_m, settings.above_camera_m),
     )
+    if (settings.lower_m is None) != (settings.upper_m is None):
+        raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
+    if settings.lower_m is None or settings.upper_m is None:
+        return views
+    grid = make_grid(settings.lower_m, settings.upper_m, settings.voxel_size_m)
+    lower, upper = _extent(views)
+    if (np.array(settings.lower_m) >= upper).any() or (np.array(settings.upper_m) <= lower).any():
+        raise UsageError(
+            f"no camera sees the box from {list(settings.lower_m)} to {list(settings.upper_m)}: "
+            f"the views reach from {lower.round(1).tolist()} to {upper.round(1).tolist()}",
+            where="grid bounds",
+            fix="give bounds relative to the site origin",
+        )
+    return grid
+
+
+def _extent(grid: GridSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of a grid, float64."""
+    lower = np.asarray(grid.origin_m, np.float64)
+    return lower, lower + np.asarray(grid.voxel_size_m, np.float64) * grid.shape

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+import re
 import resource
+import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,8 +21,11 @@ from jaxmap.config import MapConfig, config_tree
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.files import atomic_path
 from jaxmap.map_store import holds_map, load_map
+from jaxmap.mapping_plan import Plan
 from jaxmap.sequence import FusedFrame
 from jaxmap.types import VoxelMap
+
+_PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.png")
 
 
 @dataclass
@@ -33,6 +42,7 @@ class RunLog:
         total_s: time spent on frames.
         compile_s: time spent on compiling.
         temporary_bytes: memory that the step takes beside the map.
+        digest: of the frames done so far, their poses and the camera (`Plan.digest`).
         complete: whether the run has come to its end.
     """
 
@@ -45,6 +55,7 @@ class RunLog:
     total_s: float = 0.0
     compile_s: float = 0.0
     temporary_bytes: int = 0
+    digest: str = ""
     complete: bool = False
 
     def add(self, fused: FusedFrame) -> None:
@@ -93,14 +104,44 @@ class RunFolder:
         self.poses = path / "poses.tum"
         self.pictures = path / "pictures"
 
-    def begin(self, sequence: str, config: MapConfig, *, resume: bool, overwrite: bool) -> None:
-        """Makes the folder and writes the resolved configuration, or checks that a run can go on.
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps other runs out of the folder, which is made where it is missing.
 
         Raises:
-            JaxmapError: the folder holds a run already, or cannot be made.
-            UsageError: the run to be resumed had other settings.
+            JaxmapError: another run is writing into it, or it cannot be made.
         """
-        tree = {"sequence": sequence, **config_tree(config)}
+        try:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            # The folder itself is locked, so that no lock file is left behind.
+            handle = os.open(self.path, os.O_RDONLY)
+        except OSError as error:
+            raise JaxmapError(
+                f"cannot be made: {error.strerror}", where=self.path, fix="choose another --out"
+            ) from error
+        try:
+            self._lock(handle)
+            yield
+        finally:
+            os.close(handle)
+
+    def _lock(self, handle: int) -> None:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise JaxmapError(
+                "another run is writing here", where=self.path, fix="wait for it, or choose another --out"
+            ) from error
+
+    def begin(self, plan: Plan, config: MapConfig, *, resume: bool, overwrite: bool) -> None:
+        """Writes the resolved configuration, or checks that a run can go on.
+
+        Raises:
+            JaxmapError: the folder holds a run already, or files of the same names that are no run's.
+            UsageError: an input would be overwritten, or the run to be resumed had other settings.
+        """
+        self._check_apart(plan, config)
+        tree = {"sequence": plan.source, **config_tree(config)}
         # A run that has failed before its first save has left nothing to lose.
         used = holds_map(self.map) or self.metrics.exists()
         if used and resume:
@@ -112,15 +153,33 @@ class RunFolder:
                 where=self.path,
                 fix="go on with it (--resume), replace it (--overwrite), or choose another folder",
             )
-        try:
-            self.pictures.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise JaxmapError(
-                f"cannot be made: {error.strerror}", where=self.path, fix="choose another --out"
-            ) from error
-        if overwrite:
-            self._clear()
+        self._clear()
         write_yaml(self.config, tree)
+
+    @property
+    def _files(self) -> tuple[Path, ...]:
+        return (self.ply, self.geotiff, self.picture, self.metrics, self.poses, self.path / "report.html", self.config)
+
+    def _check_apart(self, plan: Plan, config: MapConfig) -> None:
+        """Refuses to write where the inputs lie."""
+        here = self.path.resolve()
+        images = {frame.left.parent.resolve() for frame in plan.sequence.frames}
+        images |= {frame.right.parent.resolve() for frame in plan.sequence.frames}
+        if here == Path(plan.source).resolve() or any(here == folder or folder in here.parents for folder in images):
+            raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
+        inputs = {path.resolve() for path in (config.poses, config.calibration) if path is not None}
+        for file in self._files:
+            if file.resolve() in inputs:
+                raise UsageError("an input would be overwritten", where=file, fix="choose another --out")
+
+    def _is_run(self) -> bool:
+        """Whether what lies here was written by a run."""
+        if holds_map(self.map):
+            return True
+        try:
+            return self.config.read_text(encoding="utf8").startswith("sequence:")
+        except (OSError, UnicodeDecodeError):
+            return False
 
     def resume_point(self) -> tuple[VoxelMap, RunLog] | None:
         """The map and log that an interrupted run has saved, or None where it has saved none.
@@ -154,13 +213,21 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Removes what an earlier run has written, and nothing else."""
-        import shutil
-
+        if not self._is_run():
+            foreign = [file.name for file in self._files if file.exists()]
+            if foreign:
+                raise JaxmapError(
+                    f"{', '.join(foreign)} would be replaced, but no run has written them",
+                    where=self.path,
+                    fix="choose another --out",
+                )
+            return
         shutil.rmtree(self.map, ignore_errors=True)
-        for file in (self.ply, self.geotiff, self.picture, self.metrics, self.poses, self.path / "report.html"):
+        for file in self._files:
             file.unlink(missing_ok=True)
         for picture in self.pictures.glob("*.png"):
-            picture.unlink()
+            if _PICTURE_NAME.fullmatch(picture.name):
+                picture.unlink()
 
 
 def _dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -64,7 +64,8 @@ def write_exports(
         path_world = None
         if folder.poses.exists():
             path_world = read_poses(folder.poses).T[:, :3, 3] - attributes.site_origin
-        top_down_picture(top, voxel_map.grid, voxel_map.classes, path_world, folder.picture)
+        grid, placed = voxel_map.grid, attributes.crs is not None
+        top_down_picture(top, grid, voxel_map.classes, path_world, folder.picture, georeferenced=placed)
 
 
 def count_voxels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> dict[str, Any]:

@@ -126,7 +126,7 @@ def test_the_place_of_config_among_the_options_does_not_matter(cli, scene_folder
 def test_a_run_ends_with_where_its_outputs_are(cli, scene_folder, tmp_path):
     outcome = cli(*map_words(scene_folder, tmp_path / "run", "--labeller", "none", "--stop", "1"))
     assert outcome.status == 0
-    assert outcome.out.splitlines()[-1].startswith(f"wrote {tmp_path / 'run'}/: map.zarr")
+    assert outcome.out.splitlines()[-1].startswith(f"wrote {tmp_path / 'run'}/: report.html, map.zarr")
     assert "1 of 1 frames fused" in outcome.err
 
 

@@ -64,6 +64,7 @@ SAME_FLOOR = {
     ("jaxmap.run_outputs", "jaxmap.run_folder"),
     ("jaxmap.mapping", "jaxmap.mapping_plan"),
     ("jaxmap.mapping", "jaxmap.run_folder"),
+    ("jaxmap.run_folder", "jaxmap.mapping_plan"),
     ("jaxmap.mapping", "jaxmap.run_outputs"),
     ("jaxmap.cli", "jaxmap.commands"),
     ("jaxmap.__main__", "jaxmap.cli"),

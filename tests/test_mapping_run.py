@@ -46,8 +46,8 @@ def planned(sequence: Path, **settings: object) -> Plan:
 def ran(sequence: Path, out: Path, **settings: object) -> dict:
     folder = RunFolder(out)
     config = config_of(**settings)
-    folder.begin(str(sequence), config, resume=False, overwrite=False)
     plan = planned(sequence, **settings)
+    folder.begin(plan, config, resume=False, overwrite=False)
     return run_plan(plan, folder, strict=config.strict, checkpoint_every_s=60.0, tell=lambda line: None)
 
 
@@ -294,7 +294,7 @@ def test_a_missing_or_broken_label_costs_its_frame_alone(scene_copy, tmp_path):
 def test_the_step_is_compiled_once_and_every_frame_told(scene_folder, tmp_path):
     plan = planned(scene_folder)
     folder = RunFolder(tmp_path / "run")
-    folder.begin(str(scene_folder), config_of(), resume=False, overwrite=False)
+    folder.begin(plan, config_of(), resume=False, overwrite=False)
     frames = []
     run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, tell=lambda line: None, on_frame=frames.append)
     assert [fused.prepared.index for fused in frames] == list(range(FRAMES))

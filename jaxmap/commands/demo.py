@@ -72,8 +72,9 @@ def main(words: Sequence[str]) -> int:
         console.tell(f"--- {labeller}, {preset} ---")
         folder = RunFolder(arguments.out / name)
         plan = plan_run(SAMPLE, config, console.tell)
-        folder.begin(SAMPLE, config, resume=False, overwrite=True)
-        metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, tell=console.tell)
+        with folder.locked():
+            folder.begin(plan, config, resume=False, overwrite=True)
+            metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, tell=console.tell)
         voxel_map, _ = load_map(folder.map)
         scores = score_motorcycle(plan.sequence, plan.front_end, voxel_map, plan.depth_range_m)
         table.append({"run": name, "labeller": labeller, "preset": preset, **scores, **_figures(metrics)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,19 +14,24 @@ from jaxmap.commands.console import Console, parse
 from jaxmap.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.errors import UsageError
 
+OUTPUTS = (
+    *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
+    *("config.yaml", "poses.tum", "pictures/"),
+)
+
 
 @dataclass(frozen=True)
 class MapArguments:
     """Map a stereo sequence: images and poses in, a voxel map and its pictures out.
 
     Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
-    poses.tum and report.html.
+    poses.tum, pictures/ and report.html.
     """
 
     sequence: tyro.conf.Positional[str]
     """Folder of one sequence, or sample:motorcycle."""
     out: Path
-    """The run folder to write."""
+    """The run folder to write; not the sequence's own folder."""
     config: str | None = None
     """YAML file, or the name of a bundled one (chiodini2020); options given here go before it."""
     resume: bool = False
@@ -53,11 +59,13 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.run_folder import RunFolder
 
     keep_compiled_programs()
+    # What ends a job on a cluster or a service is told like Ctrl-C: the map is saved first.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     folder = RunFolder(arguments.out)
     plan = plan_run(arguments.sequence, config, console.tell)
-    folder.begin(arguments.sequence, config, resume=arguments.resume, overwrite=arguments.overwrite)
-    with console.progress("mapping", len(plan.sequence.frames)) as advance:
+    with folder.locked(), console.progress("mapping", len(plan.sequence.frames)) as advance:
+        folder.begin(plan, config, resume=arguments.resume, overwrite=arguments.overwrite)
         metrics = run_plan(
             plan,
             folder,
@@ -69,7 +77,7 @@ def main(words: Sequence[str]) -> int:
     console.tell(summary(metrics))
     for skipped in metrics["sequence"]["skipped"]:
         console.tell(f"skipped {skipped['frame']}: {skipped['reason']}")
-    console.result(arguments.out, ["map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "report.html"])
+    console.result(arguments.out, OUTPUTS)
     return 0
 
 

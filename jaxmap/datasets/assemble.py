@@ -31,6 +31,7 @@ class ReadOptions:
         calibration: a camera YAML, instead of the sequence's own calibration.
         start, stop, stride: which frames, as a Python slice of the frames on disk.
         max_pose_gap_s: poses further apart are not interpolated.
+        crs: the coordinate reference system of the poses, where the data do not say it.
     """
 
     dataset: str = "auto"
@@ -41,6 +42,7 @@ class ReadOptions:
     stop: int | None = None
     stride: int = 1
     max_pose_gap_s: float = 1.0
+    crs: str | None = None
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,10 @@ def assemble(
     if options.poses_world == "auto" and not np.array_equal(T_world_source, np.eye(4)):
         told.append("the poses' world is taken for camera-like (y down) and turned z-up")
     if len(kept) < len(selected):
-        told.append(f"{len(selected) - len(kept)} of {len(selected)} frames have no pose and are left out")
+        told.append(
+            f"{len(selected) - len(kept)} of {len(selected)} frames have no pose and are left out: "
+            f"the frames span {_span(timestamps_s[selected])}, the poses {_span(track.timestamps_s)}"
+        )
     row_of_frame = np.cumsum(has_pose) - 1
     return StereoSequence(
         name=name,
@@ -170,7 +175,7 @@ def assemble(
         read_pair=read_pair,
         T_world_source=T_world_source,
         site_origin=site_origin,
-        crs=crs,
+        crs=options.crs or crs,
         notes=tuple(told),
     )
 

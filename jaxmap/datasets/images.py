@@ -53,6 +53,8 @@ def read_index_image(path: Path) -> UInt8[np.ndarray, "H W"]:
         with Image.open(path) as image:
             image.load()
             mode, pixels = image.mode, np.array(image)
+    except FileNotFoundError as fault:
+        raise FrameError("the label image is missing", where=path, fix="label every left image") from fault
     except Exception as fault:
         raise _unreadable(path, fault) from fault
     if mode not in ("L", "P"):

@@ -66,7 +66,21 @@ def _check_options(options: ReadOptions) -> None:
         raise UsageError(
             f"poses_world is {options.poses_world!r}", where="options", fix=f"choose {', '.join(get_args(PosesWorld))}"
         )
+    if options.crs is not None:
+        _check_crs(options.crs)
     if options.stride < 1:
         raise UsageError(f"stride is {options.stride}", where="options", fix="give a whole number from 1 on")
     if not (math.isfinite(options.max_pose_gap_s) and options.max_pose_gap_s > 0):
         raise UsageError(f"max_pose_gap_s is {options.max_pose_gap_s}", where="options", fix="give seconds above 0")
+
+
+def _check_crs(name: str) -> None:
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    try:
+        CRS.from_user_input(name)
+    except (CRSError, ValueError) as error:
+        raise UsageError(
+            f"{name!r} is no coordinate reference system", where="--crs", fix="give EPSG:NUMBER"
+        ) from error

@@ -116,7 +116,7 @@ def _from_above(folder: RunContents, remarks: list[str]) -> str:
     if not path.is_file():
         return ""
     try:
-        image = inline_image(path, f"Map of {_name(folder)} seen from above, north up")
+        image = inline_image(path, f"Map of {_name(folder)} seen from above")
     except JaxmapError:
         remarks.append(f"{path.name} could not be read: the view from above is left out.")
         return ""

@@ -50,11 +50,12 @@ def top_down_picture(
     path: str | os.PathLike[str],
     *,
     title: str = "",
+    georeferenced: bool = True,
 ) -> None:
     """Draws the observed part of a map from above into a PNG.
 
     Cells carry the colours of their classes (of their heights where no cell has a class), lit from the
-    north-west; axes are metres of the world.
+    north-west; axes are metres of the world, named east and north where it is `georeferenced`.
 
     Raises:
         JaxmapError: the disk is full or refuses.
@@ -72,7 +73,7 @@ def top_down_picture(
     )
 
     figure = Figure(figsize=(layout.figure_px[0] / _DPI, layout.figure_px[1] / _DPI), dpi=_DPI, facecolor="white")
-    axes = _map_axes(figure, layout)
+    axes = _map_axes(figure, layout, ("east, m", "north, m") if georeferenced else ("x, m", "y, m"))
     upper_m = origin_m + cell_m * colours.colours.shape[:2]
     axes.imshow(
         colours.colours.transpose(1, 0, 2),
@@ -89,7 +90,7 @@ def top_down_picture(
     if title:
         x = _LEFT_PX / layout.figure_px[0]
         figure.text(x, 1 - 32 / layout.figure_px[1], title, size=11, weight="bold", va="center", color=_INK)
-    _draw_footer(figure, layout, entries, colours)
+    _draw_footer(figure, layout, entries, colours, georeferenced)
     with atomic_path(path) as temporary:
         FigureCanvasAgg(figure).print_png(temporary)
 
@@ -141,7 +142,7 @@ def _lay_out(
     )
 
 
-def _map_axes(figure: Figure, layout: _Layout) -> Axes:
+def _map_axes(figure: Figure, layout: _Layout, names: tuple[str, str]) -> Axes:
     from matplotlib.ticker import MultipleLocator
 
     width, height = layout.figure_px
@@ -149,8 +150,8 @@ def _map_axes(figure: Figure, layout: _Layout) -> Axes:
     bottom = layout.legend_px + _BELOW_PX
     rectangle = (left / width, bottom / height, layout.map_px[0] / width, layout.map_px[1] / height)
     axes = figure.add_axes(rectangle, facecolor=np.array(UNOBSERVED_COLOUR) / 255)
-    axes.set_xlabel("east, m", color=_INK, size=9)
-    axes.set_ylabel("north, m", color=_INK, size=9)
+    axes.set_xlabel(names[0], color=_INK, size=9)
+    axes.set_ylabel(names[1], color=_INK, size=9)
     axes.tick_params(colors=_FAINT, labelcolor=_INK, labelsize=8, length=3, width=0.8)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(_nice(100 / layout.px_per_m)))
@@ -217,7 +218,9 @@ def _scale_room_px(figure_width_px: int) -> int:
     return _RIGHT_PX + 110 + figure_width_px // 4
 
 
-def _draw_footer(figure: Figure, layout: _Layout, entries: list[tuple[Any, str]], colours: Relief) -> None:
+def _draw_footer(
+    figure: Figure, layout: _Layout, entries: list[tuple[Any, str]], colours: Relief, georeferenced: bool
+) -> None:
     width, height = layout.figure_px
     footer = figure.add_axes((0, 0, 1, layout.legend_px / height))
     footer.set(xlim=(0, width), ylim=(0, layout.legend_px))
@@ -240,6 +243,8 @@ def _draw_footer(figure: Figure, layout: _Layout, entries: list[tuple[Any, str]]
         borderpad=0,
     )
     _draw_scale(footer, layout)
+    if georeferenced:
+        _draw_north(footer, layout)
     if colours.by_height:
         _draw_colour_bar(figure, layout, colours.height_range_m)
 
@@ -248,11 +253,15 @@ def _draw_scale(footer: Axes, layout: _Layout) -> None:
     width, middle = layout.figure_px[0], layout.legend_px - 26
     length_m = _nice(0.55 * layout.map_px[0] / 5 / layout.px_per_m)
     length_px = length_m * layout.px_per_m
-    north, right = width - _RIGHT_PX - 14, width - _RIGHT_PX - 70
+    right = width - _RIGHT_PX - 70
     footer.plot([right - length_px, right], [middle - 8] * 2, color=_INK, linewidth=2.4, solid_capstyle="butt")
     for end in (right - length_px, right):
         footer.plot([end] * 2, [middle - 14, middle - 2], color=_INK, linewidth=1.2)
     footer.text(right - length_px / 2, middle + 12, f"{length_m:g} m", ha="center", va="center", size=9, color=_INK)
+
+
+def _draw_north(footer: Axes, layout: _Layout) -> None:
+    north, middle = layout.figure_px[0] - _RIGHT_PX - 14, layout.legend_px - 26
     footer.fill(
         [north, north - 11, north, north + 11], [middle + 12, middle - 24, middle - 15, middle - 24], color=_INK
     )

@@ -73,7 +73,7 @@ def read_run(run: Path) -> RunContents:
 
 
 def _metrics(path: Path) -> dict[str, Any]:
-    fix = "map again, or bring the file back"
+    fix = "finish the run (jaxmap map ... --resume), or bring the file back"
     try:
         metrics = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

@@ -84,7 +84,7 @@ def test_given_camera_poses_are_taken_as_they_are_and_given_body_poses_are_moved
     (tmp_path / "body.csv").write_text(f"{START_NS},5,0,0,1,0,0,0\n")
     sequence = open_sequence(folder, ReadOptions(poses=tmp_path / "body.csv"))
     np.testing.assert_allclose(sequence.T_world_camera[:, :3, 3], [[5.1, 0.2, 0.3]])
-    assert sequence.notes == ("3 of 4 frames have no pose and are left out",)
+    assert sequence.notes[0].startswith("3 of 4 frames have no pose and are left out: the frames span ")
 
 
 def test_images_without_a_partner_are_dropped_and_noted(tmp_path):

@@ -81,7 +81,9 @@ def test_frames_without_a_pose_are_left_out_and_counted(tmp_path):
     folder = plain_folder(tmp_path, poses=3)
     sequence = open_sequence(folder)
     assert [frame.name for frame in sequence.frames] == ["f0", "f1", "f2"]
-    assert sequence.notes[-1] == "2 of 5 frames have no pose and are left out"
+    assert sequence.notes[-1] == (
+        "2 of 5 frames have no pose and are left out: the frames span 0.000 to 0.400 s, the poses 0.000 to 0.200 s"
+    )
     np.testing.assert_array_equal(sequence.T_world_camera, track_of(3))
     message = refused(folder, ReadOptions(start=3))
     assert message.startswith(
