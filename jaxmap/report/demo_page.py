@@ -78,7 +78,7 @@ def _table(columns: Mapping[str, str], rows: Sequence[Row]) -> str:
         for row in rows
     )
     return (
-        '<div class="tables"><figure class="wide"><table class="stages">'
+        '<div class="tables"><figure class="wide"><table class="barred">'
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></figure></div>"
     )
 
