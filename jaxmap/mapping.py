@@ -83,7 +83,8 @@ def run_plan(
     log.complete = True
     attributes = _attributes(plan, log)
     save_map(folder.map, voxel_map, attributes)
-    fused_frames = np.array([frame.name in set(log.fused) for frame in plan.sequence.frames])
+    fused_names = set(log.fused)
+    fused_frames = np.array([frame.name in fused_names for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin

@@ -112,13 +112,12 @@ class RunFolder:
             JaxmapError: another run is writing into it, or it cannot be made.
         """
         try:
-            self.pictures.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
             # The folder itself is locked, so that no lock file is left behind.
             handle = os.open(self.path, os.O_RDONLY)
         except OSError as error:
-            raise JaxmapError(
-                f"cannot be made: {error.strerror}", where=self.path, fix="choose another --out"
-            ) from error
+            reason = "it is a file" if self.path.is_file() else error.strerror
+            raise JaxmapError(f"cannot be made: {reason}", where=self.path, fix="choose another --out") from error
         try:
             self._lock(handle)
             yield
@@ -138,9 +137,8 @@ class RunFolder:
 
         Raises:
             JaxmapError: the folder holds a run already, or files of the same names that are no run's.
-            UsageError: an input would be overwritten, or the run to be resumed had other settings.
+            UsageError: the run to be resumed had other settings.
         """
-        self._check_apart(plan, config)
         tree = {"sequence": plan.source, **config_tree(config)}
         # A run that has failed before its first save has left nothing to lose.
         used = holds_map(self.map) or self.metrics.exists()
@@ -160,8 +158,12 @@ class RunFolder:
     def _files(self) -> tuple[Path, ...]:
         return (self.ply, self.geotiff, self.picture, self.metrics, self.poses, self.path / "report.html", self.config)
 
-    def _check_apart(self, plan: Plan, config: MapConfig) -> None:
-        """Refuses to write where the inputs lie."""
+    def check_apart(self, plan: Plan, config: MapConfig) -> None:
+        """Refuses to write where the inputs lie; to be called before anything is made.
+
+        Raises:
+            UsageError: the folder is the sequence's own, or an output would overwrite an input.
+        """
         here = self.path.resolve()
         images = {frame.left.parent.resolve() for frame in plan.sequence.frames}
         images |= {frame.right.parent.resolve() for frame in plan.sequence.frames}

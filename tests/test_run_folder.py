@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import signal
 
 import numpy as np
 import pytest
@@ -24,11 +25,12 @@ def files(folder):
 
 @pytest.mark.parametrize("inside", [".", "left", "right/runs"])
 def test_a_run_into_its_own_sequence_is_refused(cli, scene_copy, inside):
-    before = files(scene_copy)
+    before, folders = files(scene_copy), sorted(scene_copy.rglob("*"))
     outcome = cli(*map_words(scene_copy, scene_copy / inside, "--overwrite"))
     assert outcome.status == 2
     assert "the sequence's own" in outcome.error
     assert files(scene_copy) == before
+    assert sorted(scene_copy.rglob("*")) == folders
 
 
 def test_a_pose_file_in_use_is_not_overwritten(cli, scene_copy, tmp_path):
@@ -126,6 +128,12 @@ def test_an_interrupt_saves_what_is_there(scene_folder, tmp_path):
         run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, tell=told.append, on_frame=interrupt)
     assert told[-1] == "interrupted and saved after 3 frames; --resume goes on there"
     assert folder.resume_point()[1].next_index == 3
+
+
+def test_what_ends_a_job_is_told_like_ctrl_c(cli, scene_folder, tmp_path):
+    assert cli(*map_words(scene_folder, tmp_path / "run", "--stop", "1", "--labeller", "none")).status == 0
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGTERM)
 
 
 def test_what_killed_writers_left_is_removed(tmp_path):

@@ -64,6 +64,7 @@ def main(words: Sequence[str]) -> int:
     console = Console()
     folder = RunFolder(arguments.out)
     plan = plan_run(arguments.sequence, config, console.tell)
+    folder.check_apart(plan, config)
     with folder.locked(), console.progress("mapping", len(plan.sequence.frames)) as advance:
         folder.begin(plan, config, resume=arguments.resume, overwrite=arguments.overwrite)
         metrics = run_plan(

@@ -34,7 +34,6 @@ class _Layout:
     extent_m: tuple[float, float, float, float]
     map_px: tuple[int, int]
     figure_px: tuple[int, int]
-    above_px: int
     legend_px: int
 
     @property
@@ -137,7 +136,6 @@ def _lay_out(
         extent_m=(low_m[0], high_m[0], low_m[1], high_m[1]),
         map_px=(width, height),
         figure_px=(figure_width, height + above + _BELOW_PX + legend),
-        above_px=above,
         legend_px=legend,
     )
 
