@@ -6,6 +6,7 @@ COMMANDS: dict[str, str] = {
     "demo": "map the bundled sample with every labeller and show what comes out",
     "map": "map a stereo sequence",
     "segment": "label images with a network, and score the labels",
+    "simulate": "render a traverse, or training images, of a simulated world",
     "weights": "convert or download pretrained networks",
     "export": "write a map in another form",
     "report": "write the HTML report of a run anew",
