@@ -109,12 +109,14 @@ def _person(draw: Draw) -> Mesh:
     coat, trousers, skin = _any_colour(draw), _any_colour(draw), draw.colour((15, 30), (0.3, 0.6), (0.1, 0.6))
     step = draw.uniform(0.05, 0.3)
     parts = [
-        _ellipsoid((0, 0, 0.68 * tall), (0.16, 0.24, 0.19 * tall), coat),
+        _ellipsoid((0, 0, 0.67 * tall), (0.15, 0.21, 0.2 * tall), coat),
+        _ellipsoid((0, 0, 0.5 * tall), (0.15, 0.18, 0.07 * tall), trousers),
         _ellipsoid((0, 0, 0.93 * tall), (0.1, 0.09, 0.075 * tall), skin),
+        _ellipsoid((0, 0, 0.85 * tall), (0.07, 0.07, 0.06 * tall), skin),
     ]
     for side in (-1, 1):
-        parts.append(_ellipsoid((side * step / 2, side * 0.1, 0.26 * tall), (0.09, 0.09, 0.27 * tall), trousers))
-        parts.append(_ellipsoid((0.05 * side, side * 0.29, 0.62 * tall), (0.06, 0.06, 0.18 * tall), coat))
+        parts.append(_ellipsoid((side * step / 2, side * 0.09, 0.27 * tall), (0.09, 0.09, 0.28 * tall), trousers))
+        parts.append(_ellipsoid((0.05 * side, side * 0.23, 0.63 * tall), (0.07, 0.07, 0.19 * tall), coat))
     return join(parts)
 
 

@@ -55,9 +55,9 @@ def corner_distance(height_px: int, width_px: int) -> Float[np.ndarray, "H W"]:
 
 
 def _shoulder(light: np.ndarray) -> np.ndarray:
-    """Linear up to 0.8, then ever flatter: bright sky is not cut off hard."""
-    over = np.maximum(light - np.float32(0.8), 0)
-    return np.minimum(light, np.float32(0.8)) + np.float32(0.2) * (1 - np.exp(-over / np.float32(0.2)))
+    """Linear up to 0.65, then ever flatter: bright sky is not cut off hard."""
+    over = np.maximum(light - np.float32(0.65), 0)
+    return np.minimum(light, np.float32(0.65)) + np.float32(0.35) * (1 - np.exp(-over / np.float32(0.35)))
 
 
 def _through_mosaic(light: np.ndarray) -> np.ndarray:

@@ -124,14 +124,14 @@ def _draw_sand(draw: Draw) -> SandRecipe:
         patch_size_m=draw.ratio(0.5, 6.0),
         patch_strength=draw.uniform(0.1, 0.9),
         damp_cover=draw.uniform(0.05, 0.5) if draw.chance(0.35) else 0.0,
-        grain_contrast=draw.ratio(0.05, 0.22),
+        grain_contrast=draw.ratio(0.09, 0.3),
         grain_tint=draw.uniform(0.0, 0.04),
         grain_slope=draw.uniform(0.3, 1.3),
-        grain_relief=draw.ratio(0.05, 0.3),
+        grain_relief=draw.ratio(0.08, 0.35),
         specks_per_m2=draw.ratio(30, 6000),
         speck_brightness=draw.uniform(0.1, 0.9),
-        mottle_contrast=draw.ratio(0.02, 0.12),
-        mottle_slope=draw.uniform(0.8, 1.8),
+        mottle_contrast=draw.ratio(0.04, 0.14),
+        mottle_slope=draw.uniform(0.4, 1.4),
     )
 
 
@@ -237,7 +237,7 @@ def _draw_backdrop(draw: Draw, sand_colour: Colour) -> BackdropRecipe:
 def _draw_exposure(draw: Draw) -> ExposureRecipe:
     warm = draw.uniform(-0.08, 0.08)
     return ExposureRecipe(
-        level=draw.ratio(0.18, 0.42),
+        level=draw.ratio(0.13, 0.34),
         gamma=draw.uniform(1.8, 2.4),
         contrast=draw.uniform(0.0, 0.35),
         white_balance=(1 + warm, 1 + draw.uniform(-0.03, 0.03), 1 - warm),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 
 from jaxmap.simulation.camera_rig import CAMERA_HEIGHT_M, T_BODY_LEFT_POSITION_M

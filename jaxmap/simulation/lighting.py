@@ -87,13 +87,38 @@ def sky_irradiance(sky: Float32[np.ndarray, "R C 3"]) -> Float[np.ndarray, "3"]:
     return np.einsum("rck,r->k", sky.astype(np.float64), weight)
 
 
+def irradiance_map(sky: Float32[np.ndarray, "R C 3"]) -> Float32[np.ndarray, "P Q 3"]:
+    """Irradiance of the sky on planes of all directions; under the horizon the sky goes on as it is there.
+
+    Returns:
+        Rows from straight down to straight up, evenly in elevation; columns as in the map of the sky.
+    """
+    rows, columns = 24, 64
+    step = sky.shape[0] // rows
+    coarse = sky.reshape(rows, step, columns, sky.shape[1] // columns, 3).mean(axis=(1, 3))
+    edges = np.pi / 2 * (np.arange(rows + 1) / rows) ** 2
+    below = np.linspace(-np.pi / 2, 0, rows + 1)
+    edges = np.concatenate([below[:-1], edges])
+    radiance = np.concatenate([np.broadcast_to(coarse[:1], coarse.shape), coarse])
+    azimuth = np.pi * (2 * (np.arange(columns) + 0.5) / columns - 1)
+    directions = _directions((edges[1:] + edges[:-1]) / 2, azimuth)
+    solid_angle = (np.sin(edges[1:]) - np.sin(edges[:-1])) * (2 * np.pi / columns)
+    arriving = radiance * solid_angle[:, None, None]
+    normals = _directions(np.pi * ((np.arange(48) + 0.5) / 48 - 0.5), azimuth)
+    cosines = np.maximum(normals.reshape(-1, 3) @ directions.reshape(-1, 3).T, 0)
+    return (cosines @ arriving.reshape(-1, 3)).reshape(48, columns, 3).astype(np.float32)
+
+
+def _directions(elevation: np.ndarray, azimuth: np.ndarray) -> Float[np.ndarray, "R C 3"]:
+    flat, up = np.cos(elevation)[:, None], np.sin(elevation)[:, None] * np.ones(len(azimuth))
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], axis=-1)
+
+
 def _sky_map(recipe: SkyRecipe, sun: np.ndarray) -> Float32[np.ndarray, "R C 3"]:
     rows, columns = SKY_SHAPE
     elevation = np.pi / 2 * ((np.arange(rows) + 0.5) / rows) ** 2
     azimuth = np.pi * (2 * (np.arange(columns) + 0.5) / columns - 1)
-    up = np.sin(elevation)[:, None] * np.ones(columns)
-    east = np.cos(elevation)[:, None] * np.cos(azimuth)
-    north = np.cos(elevation)[:, None] * np.sin(azimuth)
+    east, north, up = np.moveaxis(_directions(elevation, azimuth), -1, 0)
     cos_sun = np.clip(east * sun[0] + north * sun[1] + up * sun[2], -1, 1)
     a, b, c, d, e = _CIE_SKIES[recipe.kind]
     angle = np.arccos(cos_sun)

@@ -39,10 +39,10 @@ def make_textures(sand: SandRecipe, stone: StoneRecipe, size: int = 1024) -> Tex
 
 def _grain(sand: SandRecipe, size: int) -> Float32[np.ndarray, "H W 5"]:
     fine = seamless_noise((size, size), sand.seed, slope=0.0, finest=1.5)
-    lumps = seamless_noise((size, size), sand.seed + 1, slope=sand.grain_slope, finest=2.5)
+    lumps = seamless_noise((size, size), sand.seed + 1, slope=sand.grain_slope, finest=3.5, coarsest=size / 12)
     tint = seamless_noise((size, size), sand.seed + 2, slope=0.3, finest=2.0)
     height = 0.6 * fine + lumps
-    albedo = sand.grain_contrast * (0.7 * fine + 0.7 * lumps) / 1.2
+    albedo = sand.grain_contrast * (0.4 * fine + lumps)
     albedo += _specks(size, sand)
     colour = sand.grain_tint * tint
     gain = np.float32(sand.grain_relief)
@@ -66,15 +66,15 @@ def _specks(size: int, sand: SandRecipe) -> np.ndarray:
 
 
 def _mottle(sand: SandRecipe, size: int) -> Float32[np.ndarray, "H W 3"]:
-    value = seamless_noise((size, size), sand.seed + 5, slope=sand.mottle_slope, finest=2.0)
-    tint = seamless_noise((size, size), sand.seed + 6, slope=1.2, finest=2.0)
+    value = seamless_noise((size, size), sand.seed + 5, slope=sand.mottle_slope, finest=2.0, coarsest=size / 24)
+    tint = seamless_noise((size, size), sand.seed + 6, slope=1.2, finest=2.0, coarsest=size / 24)
     contrast, colour = sand.mottle_contrast * value, 0.1 * sand.mottle_contrast * tint
     return np.stack([contrast + colour, contrast, contrast - colour], axis=-1).astype(np.float32)
 
 
 def _stone(stone: StoneRecipe) -> Float32[np.ndarray, "D D D 4"]:
     size = 64
-    value = seamless_noise((size, size, size), stone.seed, slope=stone.texture_slope, finest=1.5)
+    value = seamless_noise((size, size, size), stone.seed, slope=stone.texture_slope, finest=1.5, coarsest=32)
     height = seamless_noise((size, size, size), stone.seed + 1, slope=stone.texture_slope, finest=2.0)
     slopes = [np.float32(stone.relief) * (np.roll(height, 1, axis) - np.roll(height, -1, axis)) for axis in (2, 1, 0)]
     return np.stack([np.float32(stone.contrast) * value, *slopes], axis=-1).astype(np.float32)

@@ -49,7 +49,7 @@ def fractal_noise(
         for octave in range(octaves):
             scale = np.float32(2.0**octave / wavelength)
             layer = _gradient_noise([values * scale for values in points], seed + 101 * octave)
-            layer = (0.24 - np.abs(layer)) * 1.7 if ridged else layer
+            layer = (np.float32(0.219) - np.abs(layer)) * np.float32(1.65) if ridged else layer
             total += np.float32(gain**octave) * layer
         norm = 0.3 * np.sqrt(sum(gain ** (2 * octave) for octave in range(octaves)))
         return total / np.float32(norm)
@@ -57,7 +57,9 @@ def fractal_noise(
     return _in_chunks(evaluate, coordinates)
 
 
-def seamless_noise(shape: Sequence[int], seed: int, *, slope: float, finest: float = 0.0) -> Float[np.ndarray, "..."]:
+def seamless_noise(
+    shape: Sequence[int], seed: int, *, slope: float, finest: float = 0.0, coarsest: float = 0.0
+) -> Float[np.ndarray, "..."]:
     """Random noise that repeats without a seam, drawn by its spectrum.
 
     Args:
@@ -65,6 +67,7 @@ def seamless_noise(shape: Sequence[int], seed: int, *, slope: float, finest: flo
         seed: of the random phases.
         slope: power of the wave number that the amplitude falls with: 0 is white, 2 is soft.
         finest: wavelengths under so many cells are left out.
+        coarsest: those over so many cells, too, where it is not 0.
 
     Returns:
         float32, mean 0, standard deviation 1.
@@ -77,6 +80,8 @@ def seamless_noise(shape: Sequence[int], seed: int, *, slope: float, finest: flo
     spectrum *= frequency ** (-slope)
     if finest > 0:
         spectrum *= np.exp(-((frequency * finest) ** 2))
+    if coarsest > 0:
+        spectrum *= 1 - np.exp(-((frequency * coarsest) ** 2))
     field = np.fft.irfftn(spectrum, s=tuple(shape), axes=tuple(range(len(shape))))
     return ((field - field.mean()) / field.std()).astype(np.float32)
 
@@ -115,7 +120,7 @@ def _gradient_noise(points: Sequence[np.ndarray], seed: int) -> np.ndarray:
             gradient = (state >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-23) - np.float32(1)
             slope += gradient * (offset - np.float32(side))
         total += weight * slope
-    return total * np.float32(1.5)
+    return total * np.float32(1.65)
 
 
 def _mix(state: np.ndarray) -> np.ndarray:

@@ -105,7 +105,10 @@ def draw_rocks(
     kept &= on_path < reach_m
     kept[kept] = _apart(places[kept], diameters[kept])
     shape = Draw(recipe.seed, "shapes")
-    return [_draw_rock(place, size, recipe, stone, sand, shape) for place, size in zip(places[kept], diameters[kept], strict=True)]
+    return [
+        _draw_rock(place, size, recipe, stone, sand, shape)
+        for place, size in zip(places[kept], diameters[kept], strict=True)
+    ]
 
 
 def draw_pebbles(

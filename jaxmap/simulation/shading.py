@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxmap.simulation.lighting import Lighting
+from jaxmap.simulation.lighting import Lighting, irradiance_map
 from jaxmap.simulation.materials import GRAIN_PERIOD_M, MOTTLE_PERIOD_M, STONE_PERIODS_M, Textures
 from jaxmap.simulation.mesh import Mesh, Surface
 from jaxmap.simulation.tracer import Table, load_mitsuba, repeating_texture
@@ -53,6 +53,7 @@ class Shading:
         self._colours = [Table(world.colours[:, channel]) for channel in range(3)]
         self._grain, self._mottle = repeating_texture(textures.grain), repeating_texture(textures.mottle)
         self._stone, self._sky_map = repeating_texture(textures.stone), repeating_texture(lighting.sky)
+        self._irradiance_map = repeating_texture(irradiance_map(lighting.sky))
         self._sun = mi.Vector3f(*map(float, lighting.sun_direction))
         self._sun_irradiance = mi.Color3f(*map(float, lighting.sun_irradiance))
         self._sky_irradiance = mi.Color3f(*map(float, lighting.sky_irradiance))
@@ -71,11 +72,12 @@ class Shading:
         direction = dr.normalize(mi.Vector3f(*lane[3:6]))
         hit = self._hit(mi.Point3f(*lane[:3]), direction, coherent=True)
         hit = self._with_texture(hit, hit.distance * spread + footprint_m)
-        # Where light comes from below, the surface is turned away: keep what is left of its normal in view.
         sun = self._towards_sun(lane[6], lane[7])
         light = self._sun_irradiance * (dr.maximum(dr.dot(hit.normal, sun), 0.0) * self._open(hit, sun))
         bounce = self._cosine_direction(hit.normal, lane[8], lane[9])
-        light += math.pi * self._incoming(hit, bounce)
+        # The open sky's light is known; the bounce only tells what stands in its way, so open ground has no noise.
+        light += self._open_sky(hit.normal) + math.pi * (self._incoming(hit, bounce) - self._sky(bounce))
+        light = dr.maximum(light, 0.0)
         matt = hit.albedo / math.pi * light
         wet = self._water(hit, direction)
         seen = dr.select(hit.surface == int(Surface.WATER), wet, matt)
@@ -93,7 +95,10 @@ class Shading:
         corners = [table(face) for table in self._faces]
 
         def blend(tables: list[Table], kind: Any) -> Any:
-            parts = [kind(*(table(corner) for table in tables)) * share for corner, share in zip(corners, shares, strict=True)]
+            parts = [
+                kind(*(table(corner) for table in tables)) * share
+                for corner, share in zip(corners, shares, strict=True)
+            ]
             return parts[0] + parts[1] + parts[2]
 
         normal = dr.normalize(blend(self._normals, mi.Vector3f))
@@ -172,6 +177,15 @@ class Shading:
         row = dr.clip(row, 0.5 / self._sky_map.shape[0], 1.0 - 0.5 / self._sky_map.shape[0])
         column = dr.atan2(direction.y, direction.x) / (2 * math.pi) + 0.5
         return mi.Color3f(*self._sky_map.eval(mi.Point2f(column, row)))
+
+    def _open_sky(self, normal: Any) -> Any:
+        """Irradiance of the whole sky on a plane with this normal."""
+        mi, dr = self._mi, self._dr
+        rows = self._irradiance_map.shape[0]
+        row = dr.asin(dr.clip(normal.z, -1.0, 1.0)) / math.pi + 0.5
+        row = dr.clip(row, 0.5 / rows, 1.0 - 0.5 / rows)
+        column = dr.atan2(normal.y, normal.x) / (2 * math.pi) + 0.5
+        return mi.Color3f(*self._irradiance_map.eval(mi.Point2f(column, row)))
 
     def _towards_sun(self, first: Any, second: Any) -> Any:
         dr = self._dr
