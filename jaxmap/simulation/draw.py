@@ -110,7 +110,7 @@ def _draw_sand(draw: Draw) -> SandRecipe:
     hues, saturations, values = {
         "beach": ((24, 42), (0.22, 0.55), (0.22, 0.5)),
         "rust": ((12, 30), (0.45, 0.8), (0.2, 0.45)),
-        "dark": ((15, 220), (0.02, 0.25), (0.07, 0.16)),
+        "dark": ((15, 50), (0.0, 0.22), (0.07, 0.16)),
         "pale": ((28, 52), (0.05, 0.25), (0.45, 0.7)),
         "any": ((5, 60), (0.05, 0.6), (0.12, 0.55)),
     }[str(look)]
@@ -175,7 +175,7 @@ def _draw_rocks(draw: Draw, kind: SceneKind) -> RockFieldRecipe:
         clustered=draw.uniform(0.0, 0.7),
         flatness=(0.15, 0.5) if kind == "small" else (flat * 0.7, min(1.0, flat + 0.35)),
         roundness=(low, high),
-        burial=(0.08, draw.uniform(0.25, 0.7)),
+        burial=(0.15, draw.uniform(0.3, 0.75)),
         pebbles_per_m2=draw.ratio(0.3, 25.0) if draw.chance(0.85) else 0.0,
     )
 

@@ -24,6 +24,10 @@ from jaxmap.simulation.tracer import load_mitsuba, make_scene, run_kernel
 _ALPHAS = (1.0 / 1.1673039782614187 ** np.arange(1, 5)).astype(np.float32)[:, None, None]
 
 
+_MOST_LANES = 1 << 20
+"""Rays traced in one go: starting a kernel costs some hundredths of a second, and each ray some hundred bytes."""
+
+
 class FirstHits(NamedTuple):
     """What the middle of each pixel sees: triangle (-1 for sky) and ray parameter (0 for sky)."""
 
@@ -59,14 +63,21 @@ class Renderer:
 
     def radiance(self, rays: RayImage, samples: int, seed: Sequence[int]) -> Float32[np.ndarray, "H W 3"]:
         """Radiance that comes along the rays, the mean of `samples` per pixel; a pass over the image for each."""
-        start = np.random.default_rng([*seed, 0x11647]).random((4, *rays.shape), np.float32)
-        total = np.zeros((3, start[0].size), np.float32)
-        for sample in range(samples):
-            origin, direction = rays.at(*pixel_offsets(rays.shape, sample, seed))
-            numbers = (start + np.float32(sample) * _ALPHAS) % 1
-            lanes = np.concatenate([origin, direction, numbers]).reshape(10, -1)
-            total += run_kernel(lambda *lane: self._shading.sample(lane, rays.spread, rays.footprint_m), lanes)
-        return (total / np.float32(samples)).reshape(3, *rays.shape).transpose(1, 2, 0)
+        rows, columns = rays.shape
+        start = np.random.default_rng([*seed, 0x11647]).random((4, rows, columns), np.float32)
+        total = np.zeros((3, rows * columns), np.float32)
+        at_once = max(1, _MOST_LANES // (rows * columns))
+        for first in range(0, samples, at_once):
+            lanes = []
+            for sample in range(first, min(first + at_once, samples)):
+                origin, direction = rays.at(*pixel_offsets(rays.shape, sample, seed))
+                numbers = (start + np.float32(sample) * _ALPHAS) % 1
+                lanes.append(np.concatenate([origin, direction, numbers]).reshape(10, -1))
+            light = run_kernel(
+                lambda *lane: self._shading.sample(lane, rays.spread, rays.footprint_m), np.concatenate(lanes, axis=1)
+            )
+            total += light.reshape(3, len(lanes), -1).sum(axis=1)
+        return (total / np.float32(samples)).reshape(3, rows, columns).transpose(1, 2, 0)
 
     def first_hits(self, rays: RayImage) -> FirstHits:
         """What the very middle of each pixel sees."""

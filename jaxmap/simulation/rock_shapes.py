@@ -136,7 +136,8 @@ def _placed(
         shape = (points[part] - middle) * (np.array(size) / span) @ _attitude(stone).T
         low, high = shape[:, 2].min(), shape[:, 2].max()
         shape[:, 2] += ground[index] - low - stone.burial * (high - low)
-        vertices[part] = shape + (stone.x_m, stone.y_m, 0.0)
+        shape[:, :2] += (stone.x_m, stone.y_m)
+        vertices[part] = shape
     return vertices, ground
 
 

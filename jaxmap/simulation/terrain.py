@@ -96,20 +96,31 @@ def lattice(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def fan(
-    centre_m: tuple[float, float], heading_rad: float, half_angle_rad: float, near_m: float, far_m: float, fine: float
+    centre_m: tuple[float, float],
+    heading_rad: float,
+    half_angle_rad: float,
+    radii_m: tuple[float, float],
+    steps: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The points of a fan in front of a camera: spacing grows with distance, `fine` of it.
+    """The points of a fan in front of a camera, whose spacing grows with distance.
 
     All around the camera lies ground, too, but behind it the fan is eight times as coarse.
+
+    Args:
+        centre_m: under the camera.
+        heading_rad: where it looks.
+        half_angle_rad: of the fine part.
+        radii_m: nearest and farthest.
+        steps: spacing across and along the view, in parts of the distance.
 
     Returns:
         As `lattice` does.
     """
-    ahead = np.arange(-half_angle_rad, half_angle_rad, fine)
-    behind = np.linspace(half_angle_rad, 2 * np.pi - half_angle_rad, int(2 * np.pi / (8 * fine)))
-    angles = np.append(np.concatenate([ahead, behind[:-1]]), 2 * np.pi - half_angle_rad)
-    radii = near_m * np.exp(np.arange(0, np.log(far_m / near_m), fine))
-    radii = np.concatenate([[0.02], radii])
+    across, along = steps
+    ahead = np.arange(-half_angle_rad, half_angle_rad, across)
+    behind = np.linspace(half_angle_rad, 2 * np.pi - half_angle_rad, int(np.pi / (4 * across)))
+    angles = np.concatenate([ahead, behind])
+    radii = np.append(0.02, np.geomspace(*radii_m, int(np.log(radii_m[1] / radii_m[0]) / along)))
     angle, radius = np.meshgrid(angles, radii)
     x = centre_m[0] + radius * np.cos(heading_rad + angle)
     y = centre_m[1] + radius * np.sin(heading_rad + angle)

@@ -119,7 +119,9 @@ def render_view(seed: int, options: TrainingOptions) -> tuple[np.ndarray, np.nda
     T_world_camera = _camera_pose(T_world_body, view)
     x, y = T_world_camera[:2, 3]
     heading = float(np.arctan2(-T_world_body[1, 0], -T_world_body[0, 0]))
-    points = Points(*fan((float(x), float(y)), heading, np.deg2rad(52), 0.4, 170.0, 1.3 / options.width_px))
+    # A little over two pixels across; along the view, the ground is seen aslant.
+    steps = (3.0 / options.width_px, 4.0 / options.width_px)
+    points = Points(*fan((float(x), float(y)), heading, np.deg2rad(52), (0.4, 170.0), steps))
     places = _feature_places(recipe.seed, np.array([x, y]), heading)
     world = build_world(recipe, path, points, places, in_view=(np.array([x, y]), heading, np.deg2rad(60)))
     lighting = make_lighting(recipe.sky)

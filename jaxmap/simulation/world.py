@@ -17,7 +17,7 @@ from jaxmap.simulation.rock_shapes import Height, stone_meshes, subdivisions_for
 from jaxmap.simulation.rocks import Rock, draw_pebbles, draw_rocks
 from jaxmap.simulation.terrain import Ground, ground_mesh
 
-ROCK_REACH_M, PEBBLE_REACH_M, MARKS_REACH_M = 32.0, 9.0, 16.0
+ROCK_REACH_M, PEBBLE_REACH_M, MARKS_REACH_M = 32.0, 9.0, 12.5
 """How far from the path there are rocks, pebbles and marks."""
 
 WHEEL_FEEL_M = 0.15
