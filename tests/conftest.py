@@ -23,6 +23,7 @@ CHECKED_MODULES = (
     "labellers",
     "labels",
     "mapper",
+    "simulation",
     "stereo",
 )
 # A float annotation takes an int, as PEP 484 has it.

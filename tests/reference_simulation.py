@@ -35,7 +35,7 @@ def gradient_noise(point: list[float], seed: int) -> float:
 
 
 def sky_irradiance(sky: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Irradiance of the map of the sky on a plane that faces `normal`, cell by cell, with the horizon's row below it."""
+    """Irradiance of the map of the sky on a plane that faces `normal`; below, the horizon's row goes on."""
     rows, columns = sky.shape[:2]
     total = np.zeros(3)
     bands = [(r, math.pi / 2 * (r / rows) ** 2, math.pi / 2 * ((r + 1) / rows) ** 2) for r in range(rows)]

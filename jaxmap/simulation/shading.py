@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxmap.simulation.lighting import Lighting, irradiance_map
 from jaxmap.simulation.materials import GRAIN_PERIOD_M, MOTTLE_PERIOD_M, STONE_PERIODS_M, Textures
 from jaxmap.simulation.mesh import Mesh, Surface
-from jaxmap.simulation.tracer import Table, load_mitsuba, repeating_texture
+from jaxmap.simulation.tracer import Table, constant, load_drjit, load_mitsuba, repeating_texture
 
 _LIFT_M = 2e-3
 """Secondary rays start so far off the surface."""
@@ -24,10 +24,14 @@ _GRAIN_FEATURE_M, _STONE_FEATURES_M = 0.004, (0.02, 0.005)
 
 
 class _Hit(NamedTuple):
-    """A point on a surface: where, which way it faces, its reflectance and kind; or the sky."""
+    """A point on a surface: where, how it faces, its reflectance and kind; or the sky.
+
+    `facing` is the normal of the triangle, on the side that the ray came from; `normal` is the one it is shaded by.
+    """
 
     valid: Any
     point: Any
+    facing: Any
     normal: Any
     albedo: Any
     surface: Any
@@ -44,7 +48,7 @@ class Shading:
         self, scene: Any, world: Mesh, normals: Float[np.ndarray, "V 3"], textures: Textures, lighting: Lighting
     ) -> None:
         self._mi = mi = load_mitsuba()
-        self._dr = __import__("drjit")
+        self._dr = load_drjit()
         self._scene, self.rover = scene, None
         self._faces = [Table(world.faces[:, corner], np.uint32) for corner in range(3)]
         self._surface = Table(world.surface, np.uint32)
@@ -54,11 +58,12 @@ class Shading:
         self._grain, self._mottle = repeating_texture(textures.grain), repeating_texture(textures.mottle)
         self._stone, self._sky_map = repeating_texture(textures.stone), repeating_texture(lighting.sky)
         self._irradiance_map = repeating_texture(irradiance_map(lighting.sky))
-        self._sun = mi.Vector3f(*map(float, lighting.sun_direction))
-        self._sun_irradiance = mi.Color3f(*map(float, lighting.sun_irradiance))
-        self._sky_irradiance = mi.Color3f(*map(float, lighting.sky_irradiance))
-        self._haze = mi.Color3f(*map(float, lighting.haze))
-        self._sun_radius, self._visibility_m = lighting.sun_radius_rad, lighting.visibility_m
+        self._sun = constant(mi.Vector3f, *lighting.sun_direction)
+        self._sun_irradiance = constant(mi.Color3f, *lighting.sun_irradiance)
+        self._sky_irradiance = constant(mi.Color3f, *lighting.sky_irradiance)
+        self._haze = constant(mi.Color3f, *lighting.haze)
+        self._sun_radius = constant(mi.Float, lighting.sun_radius_rad)
+        self._visibility_m = constant(mi.Float, lighting.visibility_m)
 
     def sample(self, lane: tuple, spread: float, footprint_m: float) -> Any:
         """Radiance (RGB) along a ray.
@@ -71,7 +76,7 @@ class Shading:
         mi, dr = self._mi, self._dr
         direction = dr.normalize(mi.Vector3f(*lane[3:6]))
         hit = self._hit(mi.Point3f(*lane[:3]), direction, coherent=True)
-        hit = self._with_texture(hit, hit.distance * spread + footprint_m)
+        hit = self._with_texture(hit, hit.distance * constant(mi.Float, spread) + constant(mi.Float, footprint_m))
         sun = self._towards_sun(lane[6], lane[7])
         light = self._sun_irradiance * (dr.maximum(dr.dot(hit.normal, sun), 0.0) * self._open(hit, sun))
         bounce = self._cosine_direction(hit.normal, lane[8], lane[9])
@@ -94,17 +99,24 @@ class Shading:
         shares = (1.0 - second - third, second, third)
         corners = [table(face) for table in self._faces]
 
-        def blend(tables: list[Table], kind: Any) -> Any:
-            parts = [
-                kind(*(table(corner) for table in tables)) * share
-                for corner, share in zip(corners, shares, strict=True)
-            ]
-            return parts[0] + parts[1] + parts[2]
+        def at_corners(tables: list[Table], kind: Any) -> list:
+            return [kind(*(table(corner) for table in tables)) for corner in corners]
 
-        normal = dr.normalize(blend(self._normals, mi.Vector3f))
-        point = blend(self._vertices, mi.Vector3f)
-        distance = dr.select(valid, found.t, 0.0)
-        return _Hit(valid, point, normal, blend(self._colours, mi.Color3f), self._surface(face), distance)
+        def blend(values: list) -> Any:
+            return values[0] * shares[0] + values[1] * shares[1] + values[2] * shares[2]
+
+        places = at_corners(self._vertices, mi.Vector3f)
+        facing = dr.normalize(dr.cross(places[1] - places[0], places[2] - places[0]))
+        facing = dr.select(dr.dot(facing, direction) > 0.0, -facing, facing)
+        return _Hit(
+            valid=valid,
+            point=blend(places),
+            facing=facing,
+            normal=dr.normalize(blend(at_corners(self._normals, mi.Vector3f))),
+            albedo=blend(at_corners(self._colours, mi.Color3f)),
+            surface=self._surface(face),
+            distance=dr.select(valid, found.t, 0.0),
+        )
 
     def _with_texture(self, hit: _Hit, footprint_m: Any) -> _Hit:
         mi, dr = self._mi, self._dr
@@ -132,7 +144,7 @@ class Shading:
     def _incoming(self, hit: _Hit, direction: Any) -> Any:
         """Radiance from a direction: the sky's, or that of what stands in the way, lit by sun and sky."""
         dr = self._dr
-        other = self._hit(hit.point + _LIFT_M * hit.normal, direction, coherent=False)
+        other = self._hit(hit.point + _LIFT_M * hit.facing, direction, coherent=False)
         sun = dr.maximum(dr.dot(other.normal, self._sun), 0.0) * self._open(other, self._sun)
         # The second surface sees about half of the sky.
         lit = other.albedo / math.pi * (self._sun_irradiance * sun + 0.5 * self._sky_irradiance)
@@ -142,7 +154,7 @@ class Shading:
     def _open(self, hit: _Hit, direction: Any) -> Any:
         """1 where nothing stands between a surface and what lies in a direction, else 0."""
         mi, dr = self._mi, self._dr
-        origin = hit.point + _LIFT_M * hit.normal
+        origin = hit.point + _LIFT_M * hit.facing
         blocked = self._scene.ray_test(mi.Ray3f(origin, direction), coherent=False) | self._rover_hides(hit, direction)
         return dr.select(blocked, 0.0, 1.0)
 
@@ -151,9 +163,9 @@ class Shading:
         if self.rover is None:
             return mi.Bool(False)
         scene, T_body_world = self.rover
-        R = [mi.Vector3f(*map(float, row)) for row in T_body_world[:3, :3]]
-        dot, shift = self._dr.dot, T_body_world[:3, 3]
-        origin = mi.Point3f(*(dot(row, hit.point) + float(t) for row, t in zip(R, shift, strict=True)))
+        R = [constant(mi.Vector3f, *row) for row in T_body_world[:3, :3]]
+        dot, shift = self._dr.dot, constant(mi.Vector3f, *T_body_world[:3, 3])
+        origin = mi.Point3f(*(dot(row, hit.point) + t for row, t in zip(R, shift, strict=True)))
         return scene.ray_test(mi.Ray3f(origin, mi.Vector3f(*(dot(row, direction) for row in R))), coherent=False)
 
     def _water(self, hit: _Hit, direction: Any) -> Any:

@@ -62,6 +62,19 @@ def is_vectorised(mitsuba: Any) -> bool:
     return not str(mitsuba.variant()).startswith("scalar")
 
 
+def load_drjit() -> Any:
+    """The array library under Mitsuba."""
+    return importlib.import_module("drjit")
+
+
+def constant(kind: Any, *numbers: float) -> Any:
+    """A value that differs from world to world, kept out of the compiled kernel, which can then be used again."""
+    mi = load_mitsuba()
+    if is_vectorised(mi):
+        return kind(*(load_drjit().opaque(mi.Float, float(number)) for number in numbers))
+    return kind(*map(float, numbers))
+
+
 def find_llvm() -> str | None:
     """LLVM's library: what `DRJIT_LIBLLVM_PATH` names, else the one nearest to version 19 from 15 on."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
@@ -79,8 +92,8 @@ def find_llvm() -> str | None:
 
 def llvm_version(path: Path) -> int | None:
     """The major version that a library's path tells, or None."""
-    numbers = re.findall(r"(?:LLVM[-.]|\.so\.|llvm-|llvm@)(\d+)", str(path))
-    return int(numbers[-1]) if numbers else None
+    numbers = re.findall(r"(?:LLVM[-.]|\.so\.|llvm[-@/])(\d+)", str(path))
+    return max(map(int, numbers), default=None)
 
 
 def make_scene(vertices_m: np.ndarray, faces: np.ndarray) -> Any:
@@ -100,7 +113,7 @@ class Table:
     def __init__(self, values: np.ndarray, kind: Any = np.float32) -> None:
         mi = load_mitsuba()
         self._vectorised = is_vectorised(mi)
-        self._gather = importlib.import_module("drjit").gather
+        self._gather = load_drjit().gather
         self._values = np.ascontiguousarray(values, kind)
         self._kind = mi.UInt32 if kind is np.uint32 else mi.Float
         self._buffer = self._kind(self._values) if self._vectorised else None
@@ -114,7 +127,7 @@ class Table:
 
 def repeating_texture(values: np.ndarray) -> Any:
     """A texture (rows, columns, channels) or (layers, rows, columns, channels) that repeats, interpolated linearly."""
-    mi, dr = load_mitsuba(), importlib.import_module("drjit")
+    mi, dr = load_mitsuba(), load_drjit()
     kind = mi.Texture2f if values.ndim == 3 else mi.Texture3f
     tensor = mi.TensorXf(np.ascontiguousarray(values, np.float32))
     return kind(tensor, filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Repeat)
@@ -128,7 +141,7 @@ def run_kernel(
     Returns:
         The components of what it gives as arrays (N,) of these kinds; float32 (components, N) where none are given.
     """
-    mi, dr = load_mitsuba(), importlib.import_module("drjit")
+    mi, dr = load_mitsuba(), load_drjit()
     if is_vectorised(mi):
         result = kernel(*(mi.Float(np.ascontiguousarray(row)) for row in lanes))
         dr.eval(result)

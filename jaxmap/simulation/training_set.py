@@ -10,16 +10,18 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxmap.labels import IGNORE
 from jaxmap.simulation.camera_rig import loccam, undistorted_pixels
 from jaxmap.simulation.develop import corner_distance, develop
 from jaxmap.simulation.draw import Draw, draw_world
 from jaxmap.simulation.drive import Drive, make_path
 from jaxmap.simulation.lighting import make_lighting
 from jaxmap.simulation.materials import make_textures
+from jaxmap.simulation.mesh import ROCK, Mesh
 from jaxmap.simulation.orthomosaic import surface_labels
 from jaxmap.simulation.rays import camera_rays
 from jaxmap.simulation.recipe import SceneKind
-from jaxmap.simulation.render import Renderer
+from jaxmap.simulation.render import FirstHits, Renderer
 from jaxmap.simulation.rover import rover_mesh
 from jaxmap.simulation.terrain import Ground, fan
 from jaxmap.simulation.traverse import sand_exposure
@@ -28,6 +30,9 @@ from jaxmap.simulation.writer import claim_folder, is_whole_image, write_png, wr
 
 _VALIDATION_SHARE = 0.1
 _LENGTH_M = 1.0
+
+LEAST_ROCK_PX = 10
+"""Rocks of fewer pixels are no lesson: nobody would label them by hand."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +107,8 @@ def simulate_training_set(out: Path, options: TrainingOptions, advance: Callable
             seconds.append(time.monotonic() - started_s)
         advance(index + 1)
     order = np.random.default_rng([options.seed, 0x5917]).permutation(options.images)
-    held_back = set(order[: round(_VALIDATION_SHARE * options.images)].tolist())
+    count = max(round(_VALIDATION_SHARE * options.images), min(1, options.images - 1))
+    held_back = set(order[:count].tolist())
     for file, chosen in (("train.txt", False), ("val.txt", True)):
         lines = [f"{name}\n" for index, name in enumerate(names) if (index in held_back) == chosen]
         write_text(out / file, "".join(lines))
@@ -133,8 +139,18 @@ def render_view(seed: int, options: TrainingOptions) -> tuple[np.ndarray, np.nda
     corner = corner_distance(options.height_px, options.width_px)
     noise = np.random.default_rng([seed, 0x401])
     image = develop(radiance, recipe.exposure, sand_exposure(recipe, lighting), noise, corner)
-    labels = surface_labels(renderer.first_hits(rays), world.mesh)
+    labels = _without_specks(renderer.first_hits(rays), world.mesh)
     return image, labels, {"recipe": asdict(recipe), "view": asdict(view)}
+
+
+def _without_specks(hits: FirstHits, mesh: Mesh) -> np.ndarray:
+    """The classes, and `IGNORE` where a rock is too far away to be told from a pebble."""
+    labels = surface_labels(hits, mesh)
+    is_rock = labels == ROCK
+    rock = mesh.part[hits.face[is_rock]]
+    pixels = np.bincount(rock)
+    labels[is_rock] = np.where(pixels[rock] < LEAST_ROCK_PX, IGNORE, ROCK)
+    return labels
 
 
 def _camera_pose(T_world_body: np.ndarray, view: View) -> np.ndarray:

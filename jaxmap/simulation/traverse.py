@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxmap.datasets.pose_files import write_tum
 from jaxmap.simulation.camera_rig import body_from_left, left_from_right, loccam, scaled, undistorted_pixels
 from jaxmap.simulation.develop import corner_distance, develop, exposure_gain
 from jaxmap.simulation.draw import Draw, draw_sky, draw_world
@@ -38,7 +39,6 @@ from jaxmap.simulation.writer import (
     write_calibration,
     write_png,
     write_record,
-    write_tum,
 )
 
 _FEATURE_PLACES_M = ((2.5, 1.2), (5.0, -1.5), (4.0, 2.6), (1.0, -1.6), (7.0, 1.0), (3.0, -2.8), (6.0, 3.4), (-1.5, 1.8))

@@ -1,4 +1,4 @@
-"""Files of a simulated data set: images, depth, poses, calibration and the record of what was drawn."""
+"""Files of a simulated data set: images, depth, calibration and the record of what was drawn."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
-from scipy.spatial.transform import Rotation
+from jaxtyping import UInt8
 
-from jaxmap.datasets.images import image_size_px
+from jaxmap.datasets.images import read_image
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.files import atomic_path
 from jaxmap.stereo.rectify import StereoRig
@@ -61,20 +60,6 @@ def write_record(path: Path, record: Any) -> None:
     write_text(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
-def write_tum(path: Path, timestamps_s: Float64[np.ndarray, "N"], T: Float64[np.ndarray, "N 4 4"]) -> None:
-    """Writes TUM text, times to the millisecond, positions to the micrometre, without a header.
-
-    Raises:
-        JaxmapError: the file cannot be written.
-    """
-    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
-    rows = [
-        f"{when:.3f} {' '.join(f'{value:.6f}' for value in pose[:3, 3])} {' '.join(f'{value:.9f}' for value in xyzw)}\n"
-        for when, pose, xyzw in zip(timestamps_s, T, quaternions, strict=True)
-    ]
-    write_text(path, "".join(rows))
-
-
 def write_calibration(path: Path, rig: StereoRig) -> None:
     """Writes a raw pair as the YAML that plain folders and `--calibration` take.
 
@@ -119,11 +104,8 @@ def claim_folder(folder: Path, record: Mapping[str, Any]) -> None:
 
 
 def is_whole_image(path: Path, width_px: int, height_px: int) -> bool:
-    """Whether an image is there, readable, and of that size."""
+    """Whether an image is there, readable to its end, and of that size."""
     try:
-        if image_size_px(path) != (width_px, height_px):
-            return False
-        decoded = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except (FrameError, cv2.error):
+        return read_image(path).shape[:2] == (height_px, width_px)
+    except FrameError:
         return False
-    return decoded is not None

@@ -160,7 +160,7 @@ def test_diameters_follow_the_distribution():
     recipe = RockFieldRecipe(**{**asdict(field), "cover": 0.05, "smallest_m": 0.1, "largest_m": 1.0})
     area = 40000.0
     diameters = draw_diameters(recipe, area, np.random.default_rng(0))
-    assert (np.diff(diameters) <= 0).all() and 0.1 <= diameters.min() and diameters.max() <= 1.0
+    assert (np.diff(diameters) <= 0).all() and diameters.min() >= 0.1 and diameters.max() <= 1.0
     for bound in (0.15, 0.25, 0.4):
         edges = np.geomspace(bound, 1.0, 2000)
         middle = (edges[1:] + edges[:-1]) / 2
