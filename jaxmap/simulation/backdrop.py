@@ -78,7 +78,7 @@ def clutter_meshes(recipe: BackdropRecipe, ground_m: Height, path_m: Float[np.nd
         x, y = path_m[-1] + distance * np.array([np.cos(angle), np.sin(angle)])
         z = float(ground_m(np.array([x], np.float32), np.array([y], np.float32))[0])
         make = draw.one_of((_person, _pole, _box, _tent), (4, 2, 2, 1))
-        thing = make(draw)  # type: ignore[operator]
+        thing = make(draw)
         turn = draw.uniform(0, 2 * np.pi)
         R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
         meshes.append(thing._replace(vertices_m=(thing.vertices_m @ R.T + (x, y, z)).astype(np.float32)))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import calendar
 import colorsys
 import zlib
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +52,7 @@ class Draw:
         """A seed for something else."""
         return int(self.rng.integers(2**31))
 
-    def one_of(self, options: tuple, weights: tuple[float, ...]) -> object:
+    def one_of(self, options: tuple, weights: tuple[float, ...]) -> Any:
         """One of the options."""
         return options[int(self.rng.choice(len(options), p=np.array(weights) / sum(weights)))]
 
@@ -61,8 +63,14 @@ class Draw:
 
 def hsv(hue_deg: float, saturation: float, value: float) -> Colour:
     """Linear RGB of hue (degrees), saturation and value."""
-    red, green, blue = colorsys.hsv_to_rgb(hue_deg / 360 % 1, saturation, value)
+    red, green, blue = colorsys.hsv_to_rgb(hue_deg / 360 % 1, min(saturation, 0.95), min(value, 1.0))
     return round(red, 4), round(green, 4), round(blue, 4)
+
+
+def as_colour(values: Iterable[float]) -> Colour:
+    """Three numbers as a colour."""
+    red, green, blue = map(float, values)
+    return red, green, blue
 
 
 def draw_world(seed: int, kind: SceneKind) -> WorldRecipe:
@@ -113,7 +121,7 @@ def _draw_sand(draw: Draw) -> SandRecipe:
         "dark": ((15, 50), (0.0, 0.22), (0.07, 0.16)),
         "pale": ((28, 52), (0.05, 0.25), (0.45, 0.7)),
         "any": ((5, 60), (0.05, 0.6), (0.12, 0.55)),
-    }[str(look)]
+    }[look]
     hue, saturation, value = draw.uniform(*hues), draw.uniform(*saturations), draw.ratio(*values)
     usual = hsv(hue, saturation, value)
     patch = hsv(hue + draw.uniform(-8, 8), saturation * draw.ratio(0.6, 1.4), value * draw.ratio(0.65, 1.4))
@@ -198,10 +206,10 @@ def draw_sky(draw: Draw, sand_colour: Colour) -> SkyRecipe:
         zenith = horizon = hsv(draw.uniform(190, 230), draw.uniform(0.0, 0.12), 1.0)
     elif dusty:
         tint = np.array(sand_colour) / max(sand_colour)
-        horizon = tuple(float(c) for c in 0.4 + 0.6 * tint)
-        zenith = tuple(float(c) for c in 0.55 + 0.35 * tint)
+        horizon = as_colour(0.4 + 0.6 * tint)
+        zenith = as_colour(0.55 + 0.35 * tint)
     return SkyRecipe(
-        kind=kind,  # type: ignore[arg-type]
+        kind=kind,
         sun_azimuth_deg=draw.uniform(-180, 180),
         sun_elevation_deg=draw.uniform(12, 70),
         air=draw.uniform(0.05, 0.3) if dusty else draw.uniform(0.7, 1.3),
@@ -209,8 +217,8 @@ def draw_sky(draw: Draw, sand_colour: Colour) -> SkyRecipe:
         dust_blueness=draw.uniform(0.0, 0.4),
         overcast=overcast,
         sky_share=draw.uniform(0.5, 0.9),
-        horizon_colour=horizon,  # type: ignore[arg-type]
-        zenith_colour=zenith,  # type: ignore[arg-type]
+        horizon_colour=horizon,
+        zenith_colour=zenith,
         cloud_cover=0.0 if kind == "overcast" or dusty else draw.uniform(0.0, 0.8),
         cloud_seed=draw.seed(),
         streaky_clouds=draw.chance(0.5),
@@ -221,7 +229,8 @@ def draw_sky(draw: Draw, sand_colour: Colour) -> SkyRecipe:
 def _draw_backdrop(draw: Draw, sand_colour: Colour) -> BackdropRecipe:
     grassy = draw.chance(0.5)
     green = draw.colour((55, 110), (0.25, 0.55), (0.06, 0.22))
-    bare = tuple(c * draw.uniform(0.5, 1.1) for c in sand_colour)
+    shade = draw.uniform(0.5, 1.1)
+    bare = as_colour(c * shade * draw.ratio(0.93, 1.07) for c in sand_colour)
     return BackdropRecipe(
         seed=draw.seed(),
         sea=draw.chance(0.4),
@@ -229,7 +238,7 @@ def _draw_backdrop(draw: Draw, sand_colour: Colour) -> BackdropRecipe:
         sea_distance_m=draw.uniform(25, 70),
         ridge_distance_m=draw.uniform(35, 140),
         ridge_height_m=draw.ratio(1.0, 16.0),
-        ridge_colours=(green if grassy else bare, bare),  # type: ignore[arg-type]
+        ridge_colours=(green if grassy else bare, bare),
         clutter=draw.whole(1, 7) if draw.chance(0.5) else 0,
     )
 

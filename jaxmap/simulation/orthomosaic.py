@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from jaxmap.files import atomic_path
-from jaxmap.labels import IGNORE
 from jaxmap.simulation.mesh import BACKGROUND, ROCK, SAND, SURFACE_LABEL, Mesh
 from jaxmap.simulation.rays import RayImage, downward_rays
 from jaxmap.simulation.render import FirstHits
@@ -55,7 +54,6 @@ def ground_truth_labels(hits: FirstHits, mesh: Mesh) -> UInt8[np.ndarray, "H W"]
     labels = surface_labels(hits, mesh)
     coded = np.zeros_like(labels)
     coded[labels == SAND], coded[labels == ROCK] = 1, 2
-    coded[labels == IGNORE] = 0
     return coded
 
 

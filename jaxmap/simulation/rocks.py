@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from jaxmap.simulation.draw import LARGEST_PEBBLE_M, Draw
+from jaxmap.simulation.draw import LARGEST_PEBBLE_M, Draw, as_colour
 from jaxmap.simulation.recipe import Colour, RockFieldRecipe, SandRecipe, StoneRecipe
 
 PATH_CLEARANCE_M = 0.45
@@ -159,11 +159,9 @@ def _draw_rock(
     place: np.ndarray, diameter: float, recipe: RockFieldRecipe, stone: StoneRecipe, sand: SandRecipe, draw: Draw
 ) -> Rock:
     flatness = draw.uniform(*recipe.flatness)
-    if draw.chance(stone.sand_coloured):
-        colour = tuple(c * draw.ratio(0.8, 1.2) for c in sand.colours[0])
-    else:
-        shade = draw.ratio(0.75, 1.33)
-        colour = tuple(c * shade * draw.ratio(0.96, 1.04) for c in stone.colours[draw.whole(0, len(stone.colours) - 1)])
+    like_sand, shade = draw.chance(stone.sand_coloured), draw.ratio(0.75, 1.33)
+    plain = sand.colours[0] if like_sand else stone.colours[draw.whole(0, len(stone.colours) - 1)]
+    colour = as_colour(c * shade * draw.ratio(0.96, 1.04) for c in plain)
     layered = draw.chance(stone.layered)
     return Rock(
         x_m=float(place[0]),
@@ -179,6 +177,6 @@ def _draw_rock(
         roughness=draw.ratio(0.006, 0.06),
         layers=draw.whole(3, 9) if layered else 0,
         dust=draw.uniform(0.2, 1.0) if draw.chance(stone.dusty) else 0.0,
-        colour=colour,  # type: ignore[arg-type]
+        colour=colour,
         seed=draw.seed(),
     )
