@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Interval, Lt
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict
 
 from jaxmap.errors import UsageError
+from jaxmap.settings import Settings
 from jaxmap.stereo.options import StereoOptions
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -174,13 +175,7 @@ class MapConfig:
     plane: PlaneConfig = field(default_factory=PlaneConfig)
 
 
-_ADAPTER = TypeAdapter(MapConfig)
-
-
-def config_folder() -> Path:
-    """The folder of configurations that come with jaxmap."""
-    packaged = Path(__file__).parent / "configs"
-    return packaged if packaged.is_dir() else Path(__file__).parents[1] / "configs"
+_SETTINGS = Settings(MapConfig, "map", given=("sequence",))
 
 
 def load_config(name_or_path: str) -> MapConfig:
@@ -189,24 +184,7 @@ def load_config(name_or_path: str) -> MapConfig:
     Raises:
         UsageError: no such file, not YAML, an unknown key, or a value out of range.
     """
-    import yaml
-
-    path = Path(name_or_path)
-    if not path.exists():
-        path = config_folder() / (name_or_path if name_or_path.endswith(".yaml") else f"{name_or_path}.yaml")
-    if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in config_folder().glob("*.yaml")))
-        raise UsageError(f"no config {name_or_path!r}", fix=f"give a YAML file or one of: {known}")
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"not YAML: {error}", where=path, fix="correct the file") from error
-    except OSError as error:
-        raise UsageError(f"cannot be read: {error.strerror}", where=path) from error
-    if not isinstance(tree or {}, dict):
-        raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
-    # The resolved configuration of a run names its sequence; the command line does so here.
-    return check_config({key: value for key, value in (tree or {}).items() if key != "sequence"}, where=path)
+    return _SETTINGS.load(name_or_path)
 
 
 def check_config(tree: dict[str, Any], where: object = "the command line") -> MapConfig:
@@ -215,16 +193,12 @@ def check_config(tree: dict[str, Any], where: object = "the command line") -> Ma
     Raises:
         UsageError: names every unknown key and every value out of range.
     """
-    try:
-        config = _ADAPTER.validate_python(tree)
-    except ValidationError as error:
-        raise UsageError("; ".join(_complaints(error)), where=where, fix="see jaxmap map --help") from error
-    return config
+    return _SETTINGS.check(tree, where)
 
 
 def config_tree(config: MapConfig) -> dict[str, Any]:
     """A configuration as plain values, for YAML and JSON."""
-    return _ADAPTER.dump_python(config, mode="json")
+    return _SETTINGS.tree(config)
 
 
 def split_fusion(fusion: FusionConfig, classes: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -244,17 +218,3 @@ def split_fusion(fusion: FusionConfig, classes: Sequence[str]) -> tuple[dict[str
             fix="name classes of the map, or none",
         )
     return tree, rule
-
-
-def _complaints(error: ValidationError) -> list[str]:
-    """One clause for each fault, by its dotted key."""
-    clauses: dict[str, str] = {}
-    for fault in error.errors():
-        # Branches of a union appear in the location; they are not part of the key.
-        key = ".".join(str(part) for part in fault["loc"] if isinstance(part, int) or part.isidentifier())
-        if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-            clauses[key] = f"unknown key {key}"
-        else:
-            value = repr(fault["input"])
-            clauses.setdefault(key, f"{key} is {value[:60]}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
-    return list(clauses.values())

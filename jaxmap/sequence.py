@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +16,9 @@ from jaxmap.datasets.base import FrameRef, StereoSequence
 from jaxmap.datasets.label_files import LabelFolder
 from jaxmap.errors import FrameError
 from jaxmap.mapper import Mapper, MapperParams, StepCost, StepInfo, compile_step
+from jaxmap.prefetch import prefetch
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
 from jaxmap.types import Frame, VoxelMap
-
-In = TypeVar("In")
-Out = TypeVar("Out")
 
 
 @dataclass(frozen=True)
@@ -50,24 +46,6 @@ class FusedFrame:
     prepared: PreparedFrame
     info: StepInfo | None = None
     cost: StepCost | None = None
-
-
-def prefetch(function: Callable[[In], Out], items: Iterable[In], workers: int, ahead: int) -> Iterator[Out]:
-    """Maps a function over items in threads, in order, at most `ahead` results before they are taken."""
-    source = iter(items)
-    pending: deque[Future[Out]] = deque()
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="jaxmap")
-    try:
-        for item in source:
-            pending.append(pool.submit(function, item))
-            if len(pending) >= ahead:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        # Not waited for: the garbage collector may close this generator in one of the pool's own threads,
-        # which would wait for itself for ever.
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def prepare_frames(

@@ -34,7 +34,8 @@ from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.labellers import Labeller, make_no_labeller, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapper import Mapper, MapperParams, compile_step, make_mapper
-from jaxmap.run_folder import peak_resident_mib, write_json
+from jaxmap.output_folder import write_json
+from jaxmap.run_folder import peak_resident_mib
 from jaxmap.sequence import prepare_frames, run_sequence
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions

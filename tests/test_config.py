@@ -18,7 +18,6 @@ from jaxmap.config import (
     MapConfig,
     PlaneConfig,
     check_config,
-    config_folder,
     config_tree,
     load_config,
     split_fusion,
@@ -28,6 +27,7 @@ from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.labellers import make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
+from jaxmap.settings import config_folder
 from jaxmap.stereo.options import StereoOptions
 
 CONFIGS = sorted(config_folder().glob("*.yaml"))

@@ -46,7 +46,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.cache import keep_compiled_programs
     from jaxmap.evaluation.segmentation_scores import SegmentationScores
     from jaxmap.models.checkpoint import load_network
-    from jaxmap.run_folder import write_json
+    from jaxmap.output_folder import write_json
     from jaxmap.segmentation import (
         Segmenter,
         check_masks,

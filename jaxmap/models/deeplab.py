@@ -144,6 +144,37 @@ def pure_form(network: DeepLab) -> PureNetwork:
     return PureNetwork(network.record, network_weights(network), apply, apply_coarse)
 
 
+def training_form(
+    architecture: Architecture, batch_norms: tuple[str, ...]
+) -> Callable[[Weights, Images, PRNGKeyArray], tuple[Float[Array, "B H W C"], Weights]]:
+    """The network as it is trained: with dropout, and with batch norms that learn.
+
+    Args:
+        architecture: the network.
+        batch_norms: prefixes of the paths of batch norms that normalise by the statistics of the batch and
+            follow them; the others use the statistics they have.
+
+    Returns:
+        `(weights, images, dropout_key) -> (logits, statistics)`: the running statistics after the batch, by
+        dotted path.
+    """
+    skeleton = nnx.eval_shape(lambda: DeepLab(architecture))
+
+    def apply(weights: Weights, images: Images, dropout_key: PRNGKeyArray) -> tuple[Array, Weights]:
+        network = _filled(skeleton, weights)
+        learning = []
+        for path, module in nnx.iter_modules(network):
+            name = ".".join(map(str, path))
+            if isinstance(module, nnx.BatchNorm) and name.startswith(batch_norms):
+                module.use_running_average = False
+                learning += [f"{name}.mean", f"{name}.var"]
+        logits = network(images, dropout_key=dropout_key)
+        after = network_weights(network)
+        return logits, {name: after[name] for name in learning}
+
+    return apply
+
+
 def network_weights(network: DeepLab) -> Weights:
     """The arrays of a network by dotted path."""
     return {".".join(map(str, path)): variable.get_value() for path, variable in nnx.to_flat_state(nnx.state(network))}
