@@ -7,7 +7,7 @@ shifted slices, and a 1x1 convolution takes twice as long as the same matrix pro
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmap.models import convolution_gradients as gradients
 from jaxmap.models.architecture import Padding
-
-PRECISION = jax.lax.Precision.HIGHEST
-"""Full float32 products on accelerators too, where the default would cut the mantissa to 10 bits."""
+from jaxmap.models.convolution_gradients import PRECISION, Sliding
 
 
 def pad_amounts(size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> tuple[int, int]:
@@ -44,11 +43,13 @@ def convolve(
     depthwise: bool = False,
 ) -> Float[Array, "B h w O"]:
     """Convolution without bias; a depthwise kernel has G = 1 and as many outputs as inputs."""
-    if depthwise:
-        return depthwise_convolve(images, kernel, stride=stride, dilation=dilation, padding=padding)
     size = kernel.shape[0]
+    if depthwise:
+        forward = partial(depthwise_convolve, stride=stride, dilation=dilation, padding=padding)
+        top, left = (pad_amounts(images.shape[axis], size, stride, dilation, padding)[0] for axis in (1, 2))
+        return gradients.depthwise(forward, Sliding(size, stride, dilation, (top, left)), images, kernel)
     if size == 1:
-        return jnp.dot(images[:, ::stride, ::stride], kernel[0, 0], precision=PRECISION)
+        return gradients.pointwise(images[:, ::stride, ::stride], kernel[0, 0])
     return jax.lax.conv_general_dilated(
         images,
         kernel,
