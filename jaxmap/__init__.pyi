@@ -1,4 +1,5 @@
 from .datasets import ReadOptions, StereoSequence, open_sequence
+from .deeplab_labeller import make_deeplab_labeller
 from .errors import FrameError, JaxmapError, UsageError
 from .fusion.carve import carve
 from .fusion.integrate import integrate
@@ -59,6 +60,7 @@ __all__ = [
     "fit_plane_mlesac",
     "integrate",
     "load_map",
+    "make_deeplab_labeller",
     "make_files_labeller",
     "make_fusion_params",
     "make_grid",

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import tyro
 from annotated_types import Ge, Gt, Interval, Lt
 from pydantic import ConfigDict
 
@@ -132,6 +133,39 @@ class PlaneConfig:
     """The score of a plane."""
 
 
+def _renaming_from_words(words: list[str]) -> dict[str, str]:
+    pairs = [word.partition("=") for word in words]
+    if not all(name and equals and new_name for name, equals, new_name in pairs):
+        raise ValueError("give pairs such as bus=car")
+    return {name: new_name for name, _, new_name in pairs}
+
+
+_RENAMING_OPTION = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NETWORK=MAP",
+    instance_from_str=_renaming_from_words,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda renaming: [f"{name}={new_name}" for name, new_name in renaming.items()],
+)
+"""A dict of names on the command line; by itself tyro would make an option of each key."""
+
+
+@dataclass(frozen=True)
+class DeeplabConfig:
+    """The network as a labeller."""
+
+    __pydantic_config__ = _STRICT
+
+    class_map: Annotated[dict[str, str], _RENAMING_OPTION] = field(default_factory=dict)
+    """Classes of the network under the names of the map's, where they differ; several may become one."""
+    size_px: tuple[Annotated[int, Gt(0)], Annotated[int, Gt(0)]] | None = None
+    """Height and width that the network runs at; those of the images without it."""
+    soft: bool = True
+    """Fuse the probabilities of all classes, not only the likeliest class."""
+    temperature: Positive = 1.0
+    """Divides the logits: above 1 the probabilities are softer."""
+
+
 @dataclass(frozen=True)
 class MapConfig:
     """Everything that decides what a map comes out as."""
@@ -140,14 +174,20 @@ class MapConfig:
 
     dataset: str = "auto"
     """The reader: auto, kitti, euroc or folder."""
-    labeller: Literal["plane", "files", "none"] = "plane"
-    """What labels the points: the MLESAC plane, files of labels, or nothing."""
+    labeller: Literal["plane", "deeplab", "files", "none"] = "plane"
+    """What labels the points: the MLESAC plane, a network, files of labels, or nothing."""
+    model: Path | None = None
+    """Model file of the network, with the deeplab labeller; jaxmap weights import writes them."""
+    model_sha256: str | None = None
+    """SHA-256 that the model file must have; the config.yaml of a run tells it."""
     labels: Path | None = None
     """Folder of labels, with the files labeller: NAME.png class indices or NAME.npy probabilities."""
     labels_are: Literal["auto", "raw", "rectified"] = "auto"
     """On which pixels those labels lie; it must be said where the images are raw and jaxmap rectifies them."""
-    classes: tuple[str, ...] = ("background", "sand", "rock")
-    """The classes, in the order of the label indices."""
+    classes: tuple[str, ...] | None = None
+    """The classes of the map, in the order of the label indices: by default background sand rock; with deeplab
+    the names that deeplab.class_map gives or, without any, all classes of the network. Points of its other
+    classes are mapped without a class. Each class takes as much memory as the occupancy."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: Literal["auto", "z_up", "camera"] = "auto"
@@ -173,6 +213,7 @@ class MapConfig:
     stereo: StereoOptions = field(default_factory=StereoOptions)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     plane: PlaneConfig = field(default_factory=PlaneConfig)
+    deeplab: DeeplabConfig = field(default_factory=DeeplabConfig)
 
 
 _SETTINGS = Settings(MapConfig, "map", given=("sequence",))

@@ -54,7 +54,9 @@ def run_plan(
     elif log.next_index:
         tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
     saved_s = resumed_s = time.perf_counter()
-    frames = prepare_frames(plan.sequence, plan.front_end, plan.label_folder, first=log.next_index)
+    frames = prepare_frames(
+        plan.sequence, plan.front_end, plan.label_folder, needs=plan.labeller.needs, first=log.next_index
+    )
     run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict)
     try:
         for voxel_map, fused in run:
@@ -181,6 +183,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "depth_range_m": list(plan.depth_range_m),
         },
         "labeller": plan.labeller.name,
+        "model": {"file": str(plan.model.path), "sha256": plan.model.sha256} if plan.model is not None else None,
         "times": {
             "total_s": round(log.total_s, 3),
             "compile_s": round(log.compile_s, 3),

@@ -111,7 +111,7 @@ class RunFolder:
             JaxmapError: the folder holds a run already, or files of the same names that are no run's.
             UsageError: the run to be resumed had other settings.
         """
-        tree = {"sequence": plan.source, **config_tree(config)}
+        tree = {"sequence": plan.source, **config_tree(config), **plan.resolved}
         # A run that has failed before its first save has left nothing to lose.
         used = holds_map(self.map) or self.metrics.exists()
         if used and resume:
@@ -141,7 +141,7 @@ class RunFolder:
         images |= {frame.right.parent.resolve() for frame in plan.sequence.frames}
         if here == Path(plan.source).resolve() or any(here == folder or folder in here.parents for folder in images):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
-        inputs = {path.resolve() for path in (config.poses, config.calibration) if path is not None}
+        inputs = {path.resolve() for path in (config.poses, config.calibration, config.model) if path is not None}
         for file in self._files:
             if file.resolve() in inputs:
                 raise UsageError("an input would be overwritten", where=file, fix="choose another --out")

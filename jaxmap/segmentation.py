@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from jaxmap.datasets.images import IMAGE_SUFFIXES, read_image, read_index_image
+from jaxmap.datasets.images import IMAGE_SUFFIXES, as_rgb, read_image, read_index_image
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.files import atomic_path
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.deeplab import Images, Weights, fold_batch_norm, pure_network
+from jaxmap.models.pixelwise import check_size, resized_input, resized_output
 from jaxmap.report.pictures import overlay_labels
 
 
@@ -30,25 +30,20 @@ class Segmenter:
     """
 
     def __init__(self, model: SavedModel, size: tuple[int, int] | None = None) -> None:
-        if size is not None and min(size) < 1:
-            raise JaxmapError(f"size {size[0]} {size[1]}", where="--size", fix="give a height and a width above 0")
+        check_size(size, "--size")
         architecture, weights = fold_batch_norm(model.architecture, model.weights)
         network = pure_network(architecture, weights)
         self.classes, self._weights = architecture.classes, network.weights
 
         def run(weights: Weights, images: Images) -> jax.Array:
-            if size is None:
-                return network.apply(weights, images)
-            inside = resize_bilinear(images.astype("float32"), *size, align_corners=False)
-            logits = network.apply(weights, inside)
-            return resize_bilinear(logits, *images.shape[1:3], align_corners=False)
+            logits = network.apply(weights, resized_input(images, size))
+            return resized_output(logits, images.shape[1:3])
 
         self._run = jax.jit(run)
 
     def logits(self, image: UInt8[np.ndarray, "H W *rgb"]) -> Float[np.ndarray, "H W C"]:
         """Class logits of a grey or RGB image, at its own size."""
-        rgb = np.broadcast_to(image[..., None], (*image.shape, 3)) if image.ndim == 2 else image
-        return np.asarray(self._run(self._weights, rgb[None])[0])
+        return np.asarray(self._run(self._weights, as_rgb(image)[None])[0])
 
 
 class Labelled(NamedTuple):

@@ -142,6 +142,7 @@ def test_a_wrong_command_is_one_line(name, tmp_path, finished_run, cli, told):
         ("map", "sample:motorcycle", "--out", "run", "--stride", "two"),
         ("map", "sample:motorcycle", "--out", "run", "--labeller", "oracle"),
         ("map", "sample:motorcycle", "--out", "run", "--config"),
+        ("map", "sample:motorcycle", "--out", "run", "--deeplab.class-map", "car"),
         ("export",),
         ("export", "run", "--format", "stl"),
     ],

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from jaxmap.config import (
     RULE_FIELDS,
+    DeeplabConfig,
     FusionConfig,
     GridConfig,
     MapConfig,
@@ -113,14 +114,16 @@ def test_the_defaults_of_the_plane_are_those_of_the_functions():
 
 
 def test_every_setting_has_a_default_and_says_what_it_is():
-    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, StereoOptions):
+    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, DeeplabConfig, StereoOptions):
         source = inspect.getsource(kind)
         for field in fields(kind):
             assert field.default is not MISSING or field.default_factory is not MISSING, field.name
-            section = field.name in ("grid", "depth", "stereo", "fusion", "plane")
+            section = field.name in ("grid", "depth", "stereo", "fusion", "plane", "deeplab")
             assert section or f"    {field.name}: " in source
         described = source.count('    """') - 1
-        sections = sum(field.name in ("grid", "depth", "stereo", "fusion", "plane") for field in fields(kind))
+        sections = sum(
+            field.name in ("grid", "depth", "stereo", "fusion", "plane", "deeplab") for field in fields(kind)
+        )
         assert described == len(fields(kind)) - sections, kind.__name__
 
 

@@ -25,6 +25,7 @@ FLOORS = {
     "jaxmap.fusion": 2,
     # 3: the step and what feeds and keeps it
     "jaxmap.labellers": 3,
+    "jaxmap.deeplab_labeller": 3,
     "jaxmap.mapper": 3,
     "jaxmap.datasets": 3,
     "jaxmap.map_store": 3,
@@ -66,6 +67,7 @@ SAME_FLOOR = {
     ("jaxmap.labels", "jaxmap.errors"),
     ("jaxmap.files", "jaxmap.errors"),
     ("jaxmap.mapper", "jaxmap.labellers"),
+    ("jaxmap.deeplab_labeller", "jaxmap.labellers"),
     ("jaxmap.sequence", "jaxmap.mapper"),
     ("jaxmap.sequence", "jaxmap.labellers"),
     ("jaxmap.sequence", "jaxmap.datasets"),

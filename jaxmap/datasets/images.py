@@ -64,6 +64,11 @@ def read_index_image(path: Path) -> UInt8[np.ndarray, "H W"]:
     return pixels
 
 
+def as_rgb(image: ImageArray) -> UInt8[np.ndarray, "H W 3"]:
+    """A grey or RGB image as RGB."""
+    return np.broadcast_to(image[..., None], (*image.shape, 3)) if image.ndim == 2 else image
+
+
 def read_stereo_pair(frame: FrameRef) -> StereoPair:
     """Reads the images of one frame.
 

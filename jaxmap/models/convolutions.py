@@ -50,9 +50,11 @@ def convolve(
         return gradients.depthwise(forward, Sliding(size, stride, dilation, (top, left)), images, kernel)
     if size == 1:
         return gradients.pointwise(images[:, ::stride, ::stride], kernel[0, 0])
+    # Other products promote by themselves, as double precision needs.
+    dtype = jnp.result_type(images, kernel)
     return jax.lax.conv_general_dilated(
-        images,
-        kernel,
+        images.astype(dtype),
+        kernel.astype(dtype),
         window_strides=(stride, stride),
         padding=[pad_amounts(images.shape[axis], size, stride, dilation, padding) for axis in (1, 2)],
         rhs_dilation=(dilation, dilation),
@@ -152,3 +154,14 @@ def resize_bilinear(
 ) -> Float[Array, "B h w C"]:
     """Bilinear resizing without antialiasing, as torch and TensorFlow do it."""
     return _resize_axis(_resize_axis(images, height, 1, align_corners), width, 2, align_corners)
+
+
+def resize_matrix(source: int, target: int, *, align_corners: bool) -> Float[np.ndarray, "target source"]:
+    """What `resize_bilinear` does along one axis, as a matrix from the pixels there to those wanted."""
+    low, high, share = _resize_taps(source, target, align_corners)
+    matrix = np.zeros((target, source))
+    rows = np.arange(target)
+    # Added, not set: at the border both taps are the same pixel.
+    np.add.at(matrix, (rows, low), 1.0 - share.astype(np.float64))
+    np.add.at(matrix, (rows, high), share.astype(np.float64))
+    return matrix

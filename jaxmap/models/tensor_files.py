@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,7 @@ def _reason(fault: Exception) -> str:
     return " ".join(str(fault).split())[:120]
 
 
-def shortened(items: list[str], at_most: int = 3) -> str:
+def shortened(items: Sequence[str], at_most: int = 3) -> str:
     """The first of them, and how many more there are."""
     more = f" and {len(items) - at_most} more" if len(items) > at_most else ""
     return ", ".join(items[:at_most]) + more

@@ -72,6 +72,7 @@ def _header(folder: RunContents, voxels: OccupiedVoxels) -> str:
     facts = [
         sequence.get("dataset"),
         f"labels: {metrics['labeller']}" if metrics.get("labeller") else None,
+        Path(str(model)).name if (model := group(metrics, "model").get("file")) else None,
         sequence.get("crs") or folder.attributes.crs,
     ]
     progress = folder.attributes.progress
