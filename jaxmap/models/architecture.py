@@ -25,10 +25,10 @@ MAX_CLASSES = 255
 class Architecture:
     """A DeepLab network, apart from its weights; stored in every model file.
 
-    Two families of detail exist. The fields' defaults are those of torch implementations
-    (segmentation_models_pytorch 0.6.0 `DeepLabV3Plus`); `tf_architecture` gives those of the
-    original TensorFlow networks (Chen et al. 2018, "Encoder-Decoder with Atrous Separable
-    Convolution").
+    Families of detail exist. The fields' defaults are those of segmentation_models_pytorch 0.6.0
+    (`DeepLabV3Plus`); `tf_architecture` gives those of the original TensorFlow networks (Chen et al.
+    2018, "Encoder-Decoder with Atrous Separable Convolution"), `torchvision_architecture` those of
+    torchvision's DeepLabv3 (Chen et al. 2017, "Rethinking Atrous Convolution").
 
     Attributes:
         backbone: what computes the features.
@@ -48,10 +48,10 @@ class Architecture:
         top_conv: whether MobileNetV2 keeps its last 1x1 convolution (to 1280 channels).
         head_channels: channels of ASPP and decoder.
         atrous_rates: dilations of the ASPP branches beside the 1x1 one; none at all is allowed.
-        separable_aspp: whether those branches are depthwise separable.
+        separable_aspp: whether those branches, and the convolution after the ASPP, are depthwise separable.
         pool_first: whether the pooled branch is concatenated first (TensorFlow) or last.
         norm_inside: whether batch norm and ReLU stand between depthwise and pointwise convolutions.
-        aspp_conv: whether a separable convolution follows the ASPP.
+        aspp_conv: whether a 3x3 convolution follows the ASPP.
         low_level_channels: channels the low-level feature is reduced to.
         decoder_convs: separable convolutions of the decoder.
         align_corners: whether bilinear resizing maps corner pixels onto corner pixels.
@@ -109,6 +109,8 @@ def tf_architecture(
 
     On MobileNetV2 the original goes without atrous branches and without the last convolution.
     Only MobileNetV2 pads as TensorFlow does by itself; Xception and ResNet pad both sides alike.
+    Backbones keep the layout of the weights that can be had for them: ResNet is torchvision's (stride in
+    a stage's first unit), and MobileNetV2's low-level feature is a unit's output (24 channels).
 
     Raises:
         JaxmapError: an unknown backbone or stride, or faulty classes.
@@ -134,6 +136,32 @@ def tf_architecture(
             dropout=0.1,
             mean=(0.5, 0.5, 0.5),
             std=(0.5, 0.5, 0.5),
+        ),
+        where,
+    )
+
+
+def torchvision_architecture(
+    backbone: str, classes: Sequence[str], *, output_stride: int = 8, where: object = "architecture"
+) -> Architecture:
+    """DeepLabv3 with the details of torchvision's `deeplabv3_resnet50` and `deeplabv3_resnet101`.
+
+    Published weights are for output stride 8. At 16 the rates are halved, so that the branches see as
+    far as before.
+
+    Raises:
+        JaxmapError: an unknown backbone or stride, or faulty classes.
+    """
+    return check_architecture(
+        Architecture(
+            backbone,  # type: ignore[arg-type]
+            tuple(classes),
+            output_stride,
+            decoder=False,
+            dilate_first=False,
+            atrous_rates=(12, 24, 36) if output_stride == 8 else (6, 12, 18),
+            separable_aspp=False,
+            align_corners=False,
         ),
         where,
     )
