@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -183,19 +184,22 @@ def check_architecture(architecture: Architecture, where: object = "architecture
     if record.size_remainder not in (0, 1):
         faults.append(f"size_remainder {record.size_remainder} is neither 0 nor 1")
     names = record.classes
-    if not 1 <= len(names) <= MAX_CLASSES or len(set(names)) != len(names) or not all(names):
-        faults.append(f"classes must be 1 to {MAX_CLASSES} different names, not {list(names)[:8]}")
-    for name in ("head_channels", "low_level_channels", "decoder_convs"):
-        if not 1 <= getattr(record, name) <= 4096:
-            faults.append(f"{name} {getattr(record, name)} is not between 1 and 4096")
+    told = [name if len(name) <= 40 else f"{name[:40]}..." for name in names[:6]]
+    readable = all(name.strip() and name.isprintable() for name in names)
+    if not 1 <= len(names) <= MAX_CLASSES or len(set(names)) != len(names) or not readable:
+        faults.append(f"classes must be 1 to {MAX_CLASSES} different printable names, not {told}")
+    for name, most in (("head_channels", 4096), ("low_level_channels", 4096), ("decoder_convs", 16)):
+        if not 1 <= getattr(record, name) <= most:
+            faults.append(f"{name} {getattr(record, name)} is not between 1 and {most}")
     if any(not 1 <= rate <= 1024 for rate in record.atrous_rates) or len(record.atrous_rates) > 16:
         faults.append(f"atrous_rates {list(record.atrous_rates)} are not up to 16 numbers from 1 to 1024")
-    if not (record.backbone_eps > 0 and record.head_eps > 0):
-        faults.append("the epsilons of batch norm must be positive")
+    if not (0 < record.backbone_eps < 1 and 0 < record.head_eps < 1):
+        faults.append("the epsilons of batch norm must be between 0 and 1")
     if not 0 <= record.dropout < 1:
         faults.append(f"dropout {record.dropout} is not in [0, 1)")
-    if len(record.mean) != 3 or len(record.std) != 3 or not all(value > 0 for value in record.std):
-        faults.append("mean and std must be three numbers each, std above 0")
+    finite = all(math.isfinite(value) for value in (*record.mean, *record.std))
+    if len(record.mean) != 3 or len(record.std) != 3 or not finite or min(record.std) <= 0:
+        faults.append("mean and std must be three finite numbers each, std above 0")
     if faults:
         raise JaxmapError("; ".join(faults), where=where, fix="correct the architecture")
     return record

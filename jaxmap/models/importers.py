@@ -21,7 +21,7 @@ from jaxmap.models.architecture import (
 )
 from jaxmap.models.checkpoint import Holds, raise_mismatch
 from jaxmap.models.deeplab import weight_shapes
-from jaxmap.models.tensor_files import Tensors, read_tensors
+from jaxmap.models.tensor_files import Tensors, as_float32, read_tensors, shortened
 
 VOC_CLASSES: tuple[str, ...] = (
     *("background", "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow"),
@@ -80,7 +80,7 @@ def import_weights(
         if source.recognise(tensors):
             return source.convert(tensors, classes, output_stride, path)
     raise JaxmapError(
-        f"weights of no known kind (the first is called {next(iter(tensors), 'nothing')!r})",
+        f"weights of no known kind (there is {shortened(list(tensors), 2) or 'nothing'})",
         where=path,
         fix=f"known are {', '.join(source.name for source in SOURCES)}",
     )
@@ -160,7 +160,7 @@ def convert(
         if array.shape != shape:
             misshapen.append(f"{source} gives {list(array.shape)}, not {list(shape)}")
             continue
-        result[name] = np.ascontiguousarray(array, np.float32)
+        result[name] = as_float32(array)
     left_over = [
         name
         for name in tensors
@@ -241,7 +241,9 @@ def _torch_backbone(
     stride: int | None,
     path: Path,
 ) -> Imported:
-    architecture = torch_architecture(backbone, classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path)
+    architecture = torch_architecture(
+        backbone, classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path
+    )
     weights = convert(
         tensors, rows, tables.TORCH, architecture, holds="backbone", where=path, ignored=("classifier.", "fc.")
     )
@@ -251,12 +253,16 @@ def _torch_backbone(
 def _from_tf_folded(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
     if "logits_semantic/bias" in tensors:
         names = _class_names(tensors["logits_semantic/bias"].size, classes, path)
-        plain = tf_architecture("mobilenet_v2", names, output_stride=stride or DEFAULT_STRIDE, decoder=False, where=path)
+        plain = tf_architecture(
+            "mobilenet_v2", names, output_stride=stride or DEFAULT_STRIDE, decoder=False, where=path
+        )
         architecture = replace(plain, backbone_norm=False, head_norm=False)
         rows = [*tables.tf_folded_mobilenet_v2(top=False), *tables.tf_folded_head()]
         weights = convert(tensors, rows, tables.TENSORFLOW, architecture, holds="network", where=path)
         return Imported("TensorFlow DeepLabv3, mobilenet_v2, folded", architecture, weights, "network")
-    plain = tf_architecture("mobilenet_v2", classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path)
+    plain = tf_architecture(
+        "mobilenet_v2", classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path
+    )
     architecture = replace(plain, top_conv=True, backbone_norm=False)
     rows = list(tables.tf_folded_mobilenet_v2(top=True))
     weights = convert(tensors, rows, tables.TENSORFLOW, architecture, holds="backbone", where=path)

@@ -21,6 +21,8 @@ from jaxmap.models.importers import convert, import_weights
 GOLDEN = Path(__file__).parent.parent / "golden" / "originals_golden.npz"
 CLASSES = ("class_0", "class_1", "class_2")
 STEP = 3
+ATOL = 1e-4
+"""They agree to 1e-6; another epsilon of the batch norms, say, already changes logits by 1e-3."""
 
 
 def seeded_state_of(family: str, backbone: str) -> dict[str, np.ndarray]:
@@ -76,7 +78,7 @@ def check(
     with np.load(GOLDEN) as golden:
         expected, labels = (golden[f"{kind}/{key}_{stride}_{size[0]}x{size[1]}"] for kind in ("logits", "labels"))
     assert np.bincount(labels.ravel(), minlength=3).min() > 100, "every class wins somewhere"
-    np.testing.assert_allclose(logits[::STEP, ::STEP], expected, atol=1e-3, rtol=0)
+    np.testing.assert_allclose(logits[::STEP, ::STEP], expected, atol=ATOL, rtol=0)
     assert ((logits - logits.mean(axis=(0, 1))).argmax(axis=-1) == labels).mean() >= 0.999
 
 
