@@ -78,6 +78,8 @@ def load_model(path: str | PathLike[str]) -> SavedModel:
             weights do not fit its architecture.
     """
     path = Path(path)
+    if not path.is_file():
+        raise JaxmapError("no such model file", where=path, fix="convert one with jaxmap weights import")
     metadata, tensors = read_safetensors(path)
     architecture, holds = _read_record(metadata, path)
     tensors = {name: as_float32(value) for name, value in tensors.items()}

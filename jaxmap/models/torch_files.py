@@ -79,6 +79,8 @@ def _read(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, np.ndarray]:
     total = 0
     for name, value in content.items():
         if isinstance(name, str) and isinstance(value, StoredTensor) and "f" in value.storage.dtype:
+            if (size := value.storage.bytes) > file_bytes:
+                raise Refused(f"storage {short(value.storage.key)} is said to hold {short(size)} bytes, the file is smaller")
             total += value.check()
             if total > MAX_SHARING * file_bytes:
                 raise Refused("tensors that share their numbers many times over")
@@ -106,7 +108,7 @@ def _materialise(
     storage, dtype = tensor.storage, np.dtype(order + tensor.storage.dtype)
     if math.prod(tensor.shape) == 0:
         return np.zeros(tensor.shape, dtype.newbyteorder("="))
-    size = storage.count * dtype.itemsize
+    size = storage.bytes
     if storage.key not in buffers:
         buffers[storage.key] = _member(archive, f"{root}data/{storage.key}", size)
     # Asked each time: the file may give one storage two sizes.

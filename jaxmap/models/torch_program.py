@@ -54,6 +54,11 @@ class Storage:
     dtype: str
     count: int
 
+    @property
+    def bytes(self) -> int:
+        """How many it is said to take."""
+        return self.count * np.dtype(self.dtype).itemsize
+
 
 class Refused(Exception):
     """The file holds what is no dict of tensors."""
