@@ -37,6 +37,7 @@ def deeplab_words(scene: object, out: object, model: Path, *more: object) -> lis
 def mapped(tmp_path_factory, model) -> Path:
     """A run over the first half of the scene; only to be read."""
     from fixtures import _scene_folder
+
     from jaxmap.cli import main
 
     out = tmp_path_factory.mktemp("mapped") / "run"

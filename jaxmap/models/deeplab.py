@@ -75,8 +75,10 @@ def padded_size(size: int, record: Architecture) -> int:
 
 def normalise(images: Images, record: Architecture) -> Float[Array, "B h w 3"]:
     """Images on the scale the network was trained on, padded below and to the right with zeros (the mean)."""
-    mean, std = (jnp.asarray(values, jnp.float32) * 255 for values in (record.mean, record.std))
-    scaled = (images.astype(jnp.float32) - mean) / std
+    # Whole numbers and halves become float32; float64, which checks of gradients need, stays.
+    dtype = jnp.promote_types(images.dtype, jnp.float32)
+    mean, std = (jnp.asarray(values, dtype) * 255 for values in (record.mean, record.std))
+    scaled = (images.astype(dtype) - mean) / std
     after = [padded_size(size, record) - size for size in images.shape[1:3]]
     return jnp.pad(scaled, ((0, 0), (0, after[0]), (0, after[1]), (0, 0)))
 
