@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 from networks import write_small_model
 from PIL import Image
+from safetensors.numpy import save_file
 from scenes import CAMERA
 
 Damage = Callable[[Path, Path], list[str] | None]
@@ -172,7 +173,7 @@ def deeplab(*words: str, **model: bool) -> Damage:
 
 
 def no_model(scene: Path, folder: Path) -> list[str]:
-    (folder / "model.safetensors").write_bytes(b"no model at all")
+    save_file({"weight": np.zeros(3, np.float32)}, folder / "model.safetensors")
     return ["--labeller", "deeplab", "--model", str(folder / "model.safetensors")]
 
 
