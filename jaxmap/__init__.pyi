@@ -12,6 +12,7 @@ from .labellers import Labeller, make_files_labeller, make_no_labeller, make_pla
 from .labels import IGNORE, ROVER_CLASSES
 from .map_store import MapAttributes, load_map, save_map
 from .mapper import Mapper, MapperParams, make_mapper
+from .models.checkpoint import SavedModel, load_network
 from .sequence import prepare_frames, run_sequence
 from .stereo.front_end import StereoFrontEnd
 from .stereo.options import StereoOptions
@@ -46,6 +47,7 @@ __all__ = [
     "Plane",
     "PointLabels",
     "ReadOptions",
+    "SavedModel",
     "StereoCamera",
     "StereoFrontEnd",
     "StereoOptions",
@@ -60,6 +62,7 @@ __all__ = [
     "fit_plane_mlesac",
     "integrate",
     "load_map",
+    "load_network",
     "make_deeplab_labeller",
     "make_files_labeller",
     "make_fusion_params",

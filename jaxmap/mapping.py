@@ -183,7 +183,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "depth_range_m": list(plan.depth_range_m),
         },
         "labeller": plan.labeller.name,
-        "model": {"file": str(plan.model.path), "sha256": plan.model.sha256} if plan.model is not None else None,
+        **({"model": {"file": str(plan.model.path), "sha256": plan.model.sha256}} if plan.model is not None else {}),
         "times": {
             "total_s": round(log.total_s, 3),
             "compile_s": round(log.compile_s, 3),

@@ -212,7 +212,7 @@ def _model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
     sha256 = hashlib.sha256(config.model.read_bytes()).hexdigest()
     if config.model_sha256 is not None and config.model_sha256.lower() != sha256:
         raise UsageError(
-            f"the model's SHA-256 is {sha256[:16]}..., not {config.model_sha256[:16]}...",
+            f"the model's SHA-256 does not start with {config.model_sha256[:16]}",
             where=config.model,
             fix="give the model of that run, or leave out model_sha256",
         )

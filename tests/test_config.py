@@ -23,6 +23,7 @@ from jaxmap.config import (
     load_config,
     split_fusion,
 )
+from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.errors import UsageError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.plane import fit_plane_mlesac
@@ -49,6 +50,12 @@ def test_every_config_loads_and_is_read_to_the_last_key(path):
 
     check(tree, config_tree(config))
     assert path.read_text().startswith("#"), "says what it is"
+
+
+def test_defaults_of_the_deeplab_section_are_those_of_the_labeller():
+    labeller = inspect.signature(make_deeplab_labeller).parameters
+    for name, value in asdict(DeeplabConfig()).items():
+        assert (labeller[name].default or {}) == (value or {}), name
 
 
 def test_there_is_a_config_for_the_paper():
@@ -148,6 +155,8 @@ def test_every_setting_has_a_default_and_says_what_it_is():
         ({"seed": 2**31}, ["seed is 2147483648"]),
         ({"labeller": "oracle"}, ["labeller is 'oracle'"]),
         ({"classes": "rock"}, ["classes is 'rock'"]),
+        ({"deeplab": {"size_px": [0, 8], "temperature": 0}}, ["deeplab.size_px.0 is 0", "deeplab.temperature is 0"]),
+        ({"deeplab": {"class_map": {"bus": 3}, "softly": True}}, ["deeplab.class_map.bus", "deeplab.softly"]),
         ({"grid": None}, ["grid is None"]),
     ],
 )

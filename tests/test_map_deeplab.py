@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from fixtures import FRAMES, cli, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
+from fixtures import cli, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from networks import NETWORK_CLASSES, small_model, write_small_model
 from PIL import Image
 from test_mapping_run import log_odds, planned
 
+from jaxmap.cli import main
 from jaxmap.datasets.images import read_image
 from jaxmap.labels import IGNORE
 from jaxmap.map_store import load_map
@@ -34,15 +35,10 @@ def deeplab_words(scene: object, out: object, model: Path, *more: object) -> lis
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory, model) -> Path:
+def mapped(tmp_path_factory, scene_folder, shared_cache, model) -> Path:
     """A run over the first half of the scene; only to be read."""
-    from fixtures import _scene_folder
-
-    from jaxmap.cli import main
-
     out = tmp_path_factory.mktemp("mapped") / "run"
-    scene = _scene_folder(tmp_path_factory.getbasetemp())
-    assert main(deeplab_words(scene, out, model, "--stop", "3", *RENAMED, "--classes", "rock", "sand")) == 0
+    assert main(deeplab_words(scene_folder, out, model, "--stop", "3", *RENAMED, "--classes", "rock", "sand")) == 0
     return out
 
 

@@ -86,7 +86,7 @@ class OptimiserOptions:
     backbone_rate: Annotated[float, Interval(ge=0, le=10)] = 1.0
     """Factor on the learning rate of the backbone; 0 freezes it."""
     average: Share = 0.0
-    """Decay of a running mean of the weights that is validated and saved in their place; 0: none."""
+    """Decay of a running mean of the weights that is validated and saved in their place; less at the start; 0: none."""
 
 
 @dataclass(frozen=True)

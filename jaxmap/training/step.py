@@ -137,7 +137,9 @@ def make_trainer(
             updates, optimiser_state = optimiser.update(gradient, state.optimiser, moved)
             moved = cast(Weights, optax.apply_updates(moved, updates))
             weights = {**fixed, **moved, **statistics}
-            average = {name: decay * mean + (1 - decay) * weights[name] for name, mean in state.average.items()}
+            # Young averages must not hold on to the first, random weights.
+            held = jnp.minimum(decay, (1 + state.step) / (10 + state.step))
+            average = {name: held * mean + (1 - held) * weights[name] for name, mean in state.average.items()}
             norm = optax.global_norm(gradient)
             finite = jnp.isfinite(value) & jnp.isfinite(norm)
             new = TrainState(weights, average, optimiser_state, state.step + 1)
