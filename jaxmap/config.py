@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt, Interval, Lt
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from jaxmap.errors import UsageError
+from jaxmap.files import config_folder
 from jaxmap.stereo.options import StereoOptions
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -138,7 +139,7 @@ class MapConfig:
     __pydantic_config__ = _STRICT
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc or folder."""
+    """The reader: auto, katwijk, kitti, euroc or folder."""
     labeller: Literal["plane", "files", "none"] = "plane"
     """What labels the points: the MLESAC plane, files of labels, or nothing."""
     labels: Path | None = None
@@ -153,6 +154,10 @@ class MapConfig:
     """World of the poses: z up, camera-like (y down), or find out."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
+    camera: str | None = None
+    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    antenna_m: Triple | None = None
+    """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
     max_pose_gap_s: Positive = 1.0
@@ -175,12 +180,6 @@ class MapConfig:
 
 
 _ADAPTER = TypeAdapter(MapConfig)
-
-
-def config_folder() -> Path:
-    """The folder of configurations that come with jaxmap."""
-    packaged = Path(__file__).parent / "configs"
-    return packaged if packaged.is_dir() else Path(__file__).parents[1] / "configs"
 
 
 def load_config(name_or_path: str) -> MapConfig:
