@@ -139,7 +139,7 @@ class MapConfig:
     __pydantic_config__ = _STRICT
 
     dataset: str = "auto"
-    """The reader: auto, katwijk, kitti, euroc or folder."""
+    """The reader: auto, kitti, euroc, folder or katwijk."""
     labeller: Literal["plane", "files", "none"] = "plane"
     """What labels the points: the MLESAC plane, files of labels, or nothing."""
     labels: Path | None = None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +32,21 @@ class Stretch(NamedTuple):
     seconds: float
     speed_m_s: float = 0.3
     turn_rad_s: float = 0.0
+
+
+DRIVES = {
+    "straight": [Stretch(3, 0), Stretch(40)],
+    "curves": [Stretch(3, 0), Stretch(8), Stretch(15, 0.3, 0.1), Stretch(15, 0.3, -0.15), Stretch(8)],
+    "stops": [Stretch(10), Stretch(6, 0), Stretch(10, 0.4), Stretch(5, 0), Stretch(10, 0.3, 0.1), Stretch(4, 0)],
+    "on the spot": [Stretch(2, 0), Stretch(12), Stretch(6, 0, 0.3), Stretch(12), Stretch(10, 0, -0.3), Stretch(10)],
+    "reversing": [Stretch(2, 0), Stretch(15), Stretch(2, 0), Stretch(12, -0.25), Stretch(2, 0), Stretch(10, 0.3, 0.2)],
+    "circling": [Stretch(3, 0), Stretch(10), Stretch(60, 0.3, 0.06)],
+    "all of it": [
+        *(Stretch(4, 0), Stretch(12, 0.3, 0.05), Stretch(6, 0.3, -0.12), Stretch(3, 0), Stretch(5, 0, 0.35)),
+        *(Stretch(12, 0.35), Stretch(8, -0.2, 0.08), Stretch(2, 0), Stretch(12, 0.3, 0.1)),
+    ],
+}
+"""Kinds of drives."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +83,11 @@ class Drive(NamedTuple):
 
 
 def drive(
-    stretches: list[Stretch], seed: int = 0, heading_rad: float = 0.7, roughness_rad: float = 0.04, centre_m: float = -0.11
+    stretches: list[Stretch],
+    seed: int = 0,
+    heading_rad: float = 0.7,
+    roughness_rad: float = 0.04,
+    centre_m: float = -0.11,
 ) -> Drive:
     """Drives the stretches over rolling ground; speeds change within half a second."""
     rng = np.random.default_rng(seed)
@@ -77,9 +99,9 @@ def drive(
     heading = heading_rad + np.cumsum(turn) * STEP_S
     # The ground tilts the rover by where it is, that is by the way it went and the way it looks.
     way = np.cumsum(np.abs(speed) + 0.3 * np.abs(turn)) * STEP_S
-    ground = np.linspace(0, way[-1] + 1e-6, max(len(way) // 50, 8))
-    bumps = gaussian_filter1d(rng.normal(size=(2, len(ground))), 0.35 / (ground[1] - ground[0]), mode="wrap")
-    bumps *= roughness_rad / np.maximum(bumps.std(axis=1, keepdims=True), 1e-9)
+    ground = np.arange(0, max(way[-1], 10), 0.02)
+    bumps = gaussian_filter1d(rng.normal(size=(2, len(ground))), 0.35 / 0.02, mode="wrap")
+    bumps *= roughness_rad / bumps.std(axis=1, keepdims=True)
     roll, pitch = (smooth(np.interp(way, ground, bump), 0.2) for bump in bumps)
     R = Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], axis=-1))
     along = R.apply([1.0, 0, 0]) * speed[:, None]
@@ -103,13 +125,20 @@ def write_part(folder: Path, truth: Drive, sensors: Sensors = Sensors(), seed: i
     (folder / "gps-latlong.txt").write_text(gps_text(truth, sensors, rng))
     (folder / "imu.txt").write_text(imu_text(truth, sensors, rng))
     (folder / "odometry.txt").write_text(odometry_text(truth, sensors, rng))
-    frames_s = np.round(np.linspace(1.5, truth.times_s[-1] - 1.5, images or 40) / STEP_S) * STEP_S
-    for time_s in frames_s[:images]:
+    frames_s = np.round(np.linspace(1.5, truth.times_s[-1] - 1.5, max(images, 2)) / STEP_S)[:images] * STEP_S
+    if images:
+        (folder / "LocCam").mkdir(exist_ok=True)
+    for time_s in frames_s:
         for side in (0, 1):
-            (folder / "LocCam").mkdir(exist_ok=True)
-            picture = Image.fromarray(np.zeros((768, 1024), np.uint8))
-            picture.save(folder / "LocCam" / f"LocCam_{time_text(time_s)}_{side}.png", compress_level=1)
+            shutil.copyfile(_black_picture(), folder / "LocCam" / f"LocCam_{time_text(time_s)}_{side}.png")
     return frames_s
+
+
+@cache
+def _black_picture() -> Path:
+    path = Path(tempfile.mkdtemp()) / "black.png"
+    Image.fromarray(np.zeros((768, 1024), np.uint8)).save(path)
+    return path
 
 
 def gps_text(truth: Drive, sensors: Sensors, rng: np.random.Generator) -> str:
@@ -117,12 +146,17 @@ def gps_text(truth: Drive, sensors: Sensors, rng: np.random.Generator) -> str:
 
     times_s = np.arange(0.6, truth.times_s[-1] - 0.1, sensors.gps_every_s)
     T = truth.at(times_s)
-    antenna = T[:, :3, 3] + T[:, :3, :3] @ np.array(sensors.antenna_imu_m) + rng.normal(size=(len(T), 3)) * sensors.gps_sigma_m
+    antenna = (
+        T[:, :3, 3]
+        + T[:, :3, :3] @ np.array(sensors.antenna_imu_m)
+        + rng.normal(size=(len(T), 3)) * sensors.gps_sigma_m
+    )
     longitude, latitude = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True).transform(*antenna[:, :2].T)
     east, north, up = sensors.gps_sigma_m
     rows = zip(times_s, latitude, longitude, antenna[:, 2], strict=True)
     return "".join(
-        f"{time_text(t)} RTK_FIXED {lat:.11f} {lon:.11f} {alt:.4f} {north:.4f} {east:.4f} {up:.4f}\n" for t, lat, lon, alt in rows
+        f"{time_text(t)} RTK_FIXED {lat:.11f} {lon:.11f} {alt:.4f} {north:.4f} {east:.4f} {up:.4f}\n"
+        for t, lat, lon, alt in rows
     )
 
 
@@ -132,7 +166,7 @@ def imu_text(truth: Drive, sensors: Sensors, rng: np.random.Generator) -> str:
     rate = turned[::every]
     velocity = np.gradient(truth.position_m, STEP_S, axis=0)
     acceleration = gaussian_filter1d(np.gradient(velocity, STEP_S, axis=0), 5, axis=0)
-    force = truth.R_world_body.inv().apply(acceleration + [0, 0, 9.81])[: -every : every]
+    force = truth.R_world_body.inv().apply(acceleration + np.array([0, 0, 9.81]))[:-every:every]
     # Each sample tells the mean rate of the interval around it.
     times_s = truth.times_s[:-every:every] + STEP_S
     rate = rate @ R_BODY_IMU + sensors.gyro_bias + rng.normal(size=rate.shape) * sensors.gyro_sigma
@@ -140,7 +174,9 @@ def imu_text(truth: Drive, sensors: Sensors, rng: np.random.Generator) -> str:
     rough = force + rng.normal(size=force.shape) * 4 * sensors.force_sigma
     fine = force + rng.normal(size=force.shape) * sensors.force_sigma
     table = np.hstack([rough, rate, fine])
-    return "".join(f"{time_text(t)} {' '.join(f'{v:.6f}' for v in row)}\n" for t, row in zip(times_s, table, strict=True))
+    return "".join(
+        f"{time_text(t)} {' '.join(f'{v:.6f}' for v in row)}\n" for t, row in zip(times_s, table, strict=True)
+    )
 
 
 def odometry_text(truth: Drive, sensors: Sensors, rng: np.random.Generator) -> str:
@@ -156,5 +192,6 @@ def odometry_text(truth: Drive, sensors: Sensors, rng: np.random.Generator) -> s
     joints[:, :6, 0], joints[:, :6, 1] = angles, rates
     table = np.hstack([joints.reshape(len(index), 30), rng.normal(size=(len(index), 3)) * 0.01])
     return "".join(
-        f"{time_text(t)} {' '.join(f'{v:.6f}' for v in row)}\n" for t, row in zip(truth.times_s[index], table, strict=True)
+        f"{time_text(t)} {' '.join(f'{v:.6f}' for v in row)}\n"
+        for t, row in zip(truth.times_s[index], table, strict=True)
     )

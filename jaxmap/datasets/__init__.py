@@ -16,5 +16,5 @@ __all__ = [
     "register",
 ]
 
-for _reader in (katwijk.READER, kitti.READER, euroc.READER, folder.READER):
+for _reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER):
     register(_reader)

@@ -6,6 +6,7 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -28,12 +29,17 @@ from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import JaxmapError
 from jaxmap.files import config_folder
 from jaxmap.localisation.estimate import RoverPoses, estimate_poses
-from jaxmap.localisation.sensors import RoverGeometry
+from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, time_to_nearest
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
 
+Log = TypeVar("Log", GpsFixes, ImuLog, WheelLog)
+
 CRS = "EPSG:32631"
 """UTM 31 north, in which Katwijk lies; poses given for a part are in it."""
+
+AROUND_FRAMES_S = 3600.0
+"""What was recorded farther from all frames is not looked at; a garbled line can tell any year."""
 
 FAR_FROM_FIX_S = 5.0
 """Frames farther from any GPS fix are counted: fixes come every 3 s."""
@@ -104,11 +110,20 @@ def _calibration(camera: RoverCamera, options: ReadOptions) -> StereoCamera | St
 def _estimated_track(folder: Path, options: ReadOptions, frame_times_s: np.ndarray) -> tuple[PoseTrack, str, list[str]]:
     """Poses of the body in UTM, which UTM, and what they rest on."""
     (gps, gps_notes), (imu, imu_notes), (wheels, wheel_notes) = read_gps(folder), read_imu(folder), read_wheels(folder)
+    gps = gps._replace(fixes=_around(gps.fixes, frame_times_s))
+    imu, wheels = _around(imu, frame_times_s), _around(wheels, frame_times_s) if wheels else None
     antenna_body_m = R_BODY_IMU @ np.array(options.antenna_m or ANTENNA_IMU_M)
     geometry = RoverGeometry(antenna_body_m, IMU_HEIGHT_M, TURNING_CENTRE_M)
     poses = estimate_poses(gps.fixes, imu, wheels, geometry, where=folder)
     track = make_pose_track(poses.timestamps_s, poses.T_world_body, child="body", where=folder)
     return track, gps.crs, [*_told(poses, gps, frame_times_s), *gps_notes, *imu_notes, *wheel_notes]
+
+
+def _around(log: Log, frame_times_s: np.ndarray) -> Log:
+    """The part of a recording from an hour before the first frame to an hour after the last."""
+    times_s = log[0]
+    near = (times_s > frame_times_s[0] - AROUND_FRAMES_S) & (times_s < frame_times_s[-1] + AROUND_FRAMES_S)
+    return type(log)(*(values[near] for values in log))
 
 
 def _told(poses: RoverPoses, gps: Gps, frame_times_s: np.ndarray) -> list[str]:
@@ -120,7 +135,7 @@ def _told(poses: RoverPoses, gps: Gps, frame_times_s: np.ndarray) -> list[str]:
     ]
     if np.isfinite(poses.wheel_scale):
         notes.append(f"between fixes the wheels count, with a radius of {poses.wheel_scale * WHEEL_RADIUS_M:.4f} m")
-    away_s = np.abs(frame_times_s[:, None] - gps.fixes.timestamps_s[None, :]).min(axis=1)
+    away_s = time_to_nearest(gps.fixes.timestamps_s, frame_times_s)
     if far := int((away_s > FAR_FROM_FIX_S).sum()):
         notes.append(
             f"{far} of {len(away_s)} frames have no GPS fix within {FAR_FROM_FIX_S:g} s (at most {away_s.max():.0f} s)"

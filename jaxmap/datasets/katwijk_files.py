@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from jaxmap.datasets.geodesy import to_utm, utm_crs
 from jaxmap.errors import JaxmapError
@@ -25,8 +26,11 @@ GPS_FILES = ("gps-latlong.txt", "gps-utm31.txt")
 WHEEL_RADIUS_M = 0.12
 """A first guess (the estimate betters it): the IMU's height over the ground less the wheel axles' depth below it."""
 
-STANDING_RATE = 0.04
-"""A wheel that turns no faster, in rad/s, stands: 5 mm/s, and above the noise of the rates."""
+STANDING_RATE = 0.015
+"""Wheels that turn no faster, in rad/s, stand: 2 mm/s, and above the noise of the mean of some rates."""
+
+STANDING_SAMPLES = 9
+"""So many rates are averaged for that, 0.7 s."""
 
 LEAST_GPS_SIGMA_M = 0.005
 """Receivers report less at times; the antenna's mast sways more."""
@@ -128,7 +132,7 @@ def read_wheels(folder: Path) -> tuple[WheelLog | None, list[str]]:
     table = _read_table(path, 33, lambda row: max(map(abs, row[1 : 3 * _WHEELS : 3])) < 100)
     rates = table.values[:, 1 : 3 * _WHEELS : 3]
     sides = np.median(rates[:, 0::2], axis=1), np.median(rates[:, 1::2], axis=1)
-    turning = np.abs(rates).max(axis=1) > STANDING_RATE
+    turning = np.abs(uniform_filter1d(rates, STANDING_SAMPLES, axis=0)).max(axis=1) > STANDING_RATE
     return WheelLog(table.timestamps_s, WHEEL_RADIUS_M * (sides[0] + sides[1]) / 2, turning), table.notes
 
 

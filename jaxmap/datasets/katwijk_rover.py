@@ -16,6 +16,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.katwijk_files import read_pan_tilt
+from jaxmap.localisation.sensors import time_to_nearest
 
 ANTENNA_IMU_M = (0.221, -0.052, 1.5785)
 """The GPS antenna in the IMU frame. Sources differ on its height (1.503 m): `ReadOptions.antenna_m` sets it."""
@@ -97,8 +98,7 @@ def body_to_camera(
     T_mount_turned = np.tile(np.eye(4), (len(timestamps_s), 1, 1))
     T_mount_turned[:, :3, :3] = Rotation.from_euler("ZY", np.stack([pan, tilt], axis=-1)).as_matrix()
     notes = [*notes, "pan and tilt of ptu.txt are taken for radians, positive to the left and down"]
-    after = np.searchsorted(ptu_s, timestamps_s).clip(1, len(ptu_s) - 1) if len(ptu_s) > 1 else np.zeros(1, int)
-    away_s = np.minimum(np.abs(ptu_s[after] - timestamps_s), np.abs(ptu_s[after - 1] - timestamps_s))
+    away_s = time_to_nearest(ptu_s, timestamps_s)
     if far := int((away_s > MAX_PAN_TILT_GAP_S).sum()):
         notes.append(f"{far} of {len(timestamps_s)} frames have no pan and tilt within {MAX_PAN_TILT_GAP_S:g} s")
     return T_body_imu @ camera.T_imu_mount @ T_mount_turned @ camera.T_mount_camera, notes

@@ -97,7 +97,10 @@ def _pinhole(camera: Mapping[str, Any], path: Path) -> np.ndarray:
 
 def _distortion(camera: Mapping[str, Any], path: Path) -> np.ndarray:
     """OpenCV's k1 k2 p1 p2 k3."""
-    radial, tangential = np.ravel(camera.get("RadialDistortion", [])), np.ravel(camera.get("TangentialDistortion", [0, 0]))
+    radial, tangential = (
+        np.ravel(camera.get("RadialDistortion", [])),
+        np.ravel(camera.get("TangentialDistortion", [0, 0])),
+    )
     if radial.size not in (2, 3) or tangential.size != 2 or {radial.dtype.kind, tangential.dtype.kind} - set("fiu"):
         raise JaxmapError("not 2 or 3 radial and 2 tangential coefficients", where=path, fix="restore the file")
     return np.concatenate([radial[:2], tangential, radial[2:]])

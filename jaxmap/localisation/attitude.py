@@ -68,7 +68,7 @@ def estimate_tilt(
 
     up = measured / np.maximum(np.linalg.norm(measured, axis=1, keepdims=True), 1e-9)
     bias = np.zeros_like(up)
-    huber = np.ones(len(up))
+    huber = felt = _felt_around(silent)
     for _ in range(4):
         chain = ChainLeastSquares(len(knots_s), 6)
         middle = (up[:-1] + up[1:]) / 2
@@ -85,8 +85,13 @@ def estimate_tilt(
         step = chain.step()
         up, bias = up + step[:, :3], bias + step[:, 3:]
         off = np.linalg.norm(up - measured, axis=1) / (FORCE_SIGMA_M_S2 / GRAVITY_M_S2)
-        huber = HUBER / np.maximum(off, HUBER)
+        huber = felt * HUBER / np.maximum(off, HUBER)
     return Tilt(np.arctan2(up[:, 1], up[:, 2]), np.arctan2(-up[:, 0], np.hypot(up[:, 1], up[:, 2])))
+
+
+def _felt_around(silent: np.ndarray) -> np.ndarray:
+    """Weights of the inclinometer at the knots, (K,): next to none beside a gap of the IMU, else 1."""
+    return np.where(np.append(silent, False) | np.append(False, silent), 1e-6, 1.0)
 
 
 def _mean_around(imu: ImuLog, knots_s: np.ndarray) -> np.ndarray:

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.errors import JaxmapError
 from jaxmap.localisation.attitude import Tilt, estimate_tilt
-from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, in_gap, increments
-from jaxmap.localisation.track import Motion, estimate_track
+from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, in_gap, increments, time_to_nearest
+from jaxmap.localisation.track import estimate_track
+from jaxmap.localisation.track_terms import Motion
 
 KNOT_SPACING_S = 0.1
 """Poses are estimated this densely; at a rover's pace they are as good as straight between."""
@@ -55,7 +56,13 @@ def estimate_poses(
         JaxmapError: the recordings do not overlap, or tell no heading as the rover does not move.
     """
     if len(imu.timestamps_s) < 3:
-        raise JaxmapError(f"the IMU has {len(imu.timestamps_s)} samples", where=where, fix="give --poses FILE")
+        raise JaxmapError(
+            f"{len(imu.timestamps_s)} samples of the IMU lie near the times of the images",
+            where=where,
+            fix="check that both use one clock, or give --poses FILE",
+        )
+    if wheels is not None and len(wheels.timestamps_s) < 2:
+        wheels = None
     within = (fixes.timestamps_s >= imu.timestamps_s[0]) & (fixes.timestamps_s <= imu.timestamps_s[-1])
     fixes = GpsFixes(*(values[within] for values in fixes))
     if len(fixes.timestamps_s) < 2:
@@ -99,10 +106,8 @@ def knot_times(imu_s: Float64[np.ndarray, "N"], fixes_s: Float64[np.ndarray, "F"
     cells = np.floor((imu_s - imu_s[0]) / KNOT_SPACING_S)
     chosen = imu_s[np.unique(cells, return_index=True)[1]]
     chosen = np.union1d(chosen, imu_s[-1:])
-    nearest = np.abs(fixes_s[np.searchsorted(fixes_s, chosen).clip(0, len(fixes_s) - 1)] - chosen)
-    before = np.abs(fixes_s[(np.searchsorted(fixes_s, chosen) - 1).clip(0)] - chosen)
     # A sample right beside a fix would make an interval of no length.
-    return np.union1d(chosen[np.minimum(nearest, before) > KNOT_SPACING_S / 10], fixes_s)
+    return np.union1d(chosen[time_to_nearest(fixes_s, chosen) > KNOT_SPACING_S / 10], fixes_s)
 
 
 def _motion(imu: ImuLog, wheels: WheelLog | None, tilt: Tilt, knots_s: np.ndarray) -> Motion:

@@ -95,3 +95,12 @@ def in_gap(timestamps_s: Float64[np.ndarray, "N"], times_s: Float64[np.ndarray, 
     inside = (times_s >= before_s) & (times_s <= after_s)
     on_sample = (times_s == before_s) | (times_s == after_s)
     return ~inside | ((after_s - before_s > MAX_SENSOR_GAP_S) & ~on_sample)
+
+
+def time_to_nearest(
+    timestamps_s: Float64[np.ndarray, "N"], times_s: Float64[np.ndarray, "M"]
+) -> Float64[np.ndarray, "M"]:
+    """How far times lie from the nearest of at least one increasing timestamps."""
+    after = np.searchsorted(timestamps_s, times_s)
+    neighbours = timestamps_s[np.stack([after - 1, after]).clip(0, len(timestamps_s) - 1)]
+    return np.abs(neighbours - times_s).min(axis=0)
