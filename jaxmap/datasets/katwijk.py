@@ -81,7 +81,9 @@ def open_katwijk(folder: Path, options: ReadOptions) -> StereoSequence:
     times_s = np.array([frame.timestamp_s for frame in pairs.frames])
     if options.poses:
         track, T_child_camera = read_pose_track(options, None, options.poses), None
-        crs, told = (CRS, []) if _looks_like_utm(track) else (None, ["the poses given are not UTM: --crs says what"])
+        crs, told = (
+            (CRS, []) if _looks_like_utm(track) else (None, ["the poses given are not UTM: --crs says what they are"])
+        )
     else:
         track, crs, told = _estimated_track(folder, options, times_s)
         T_child_camera, told_by_mount = body_to_camera(folder, camera, times_s)

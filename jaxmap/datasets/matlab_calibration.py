@@ -35,10 +35,10 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
     # Loads much that no other reader needs.
     from scipy.io import loadmat
 
+    if not path.is_file():
+        raise JaxmapError(f"there is no file {path}", fix="check the path")
     try:
         content = loadmat(path, simplify_cells=True)
-    except FileNotFoundError as fault:
-        raise JaxmapError(f"there is no file {path}", fix="check the path") from fault
     except NotImplementedError as fault:
         raise JaxmapError("a MAT file of version 7.3", where=path, fix="save it in MATLAB with -v7") from fault
     except Exception as fault:
@@ -48,7 +48,8 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
         if all(isinstance(stereo.get(key), Mapping) for key in _CAMERA_KEYS) and set(_STEREO_KEYS) <= set(stereo):
             return _rig(stereo["CameraParameters1"], stereo["CameraParameters2"], stereo, size_px, path)
     # Objects refer to each other by numbers; the two cameras are saved in their order.
-    structs = structs_of_objects(np.asarray(content.get("__function_workspace__", [])).tobytes(), path)
+    hidden = content.get("__function_workspace__")
+    structs = [] if hidden is None else structs_of_objects(np.asarray(hidden).tobytes(), path)
     cameras = [struct for struct in structs if "RadialDistortion" in struct]
     stereo = next((struct for struct in structs if set(_STEREO_KEYS) <= set(struct)), None)
     if stereo is None or len(cameras) < 2:
