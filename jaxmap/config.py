@@ -173,7 +173,7 @@ class MapConfig:
     __pydantic_config__ = _STRICT
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc or folder."""
+    """The reader: auto, kitti, euroc, folder or katwijk."""
     labeller: Literal["plane", "deeplab", "files", "none"] = "plane"
     """What labels the points: the MLESAC plane, a network, files of labels, or nothing."""
     model: Path | None = None
@@ -194,6 +194,10 @@ class MapConfig:
     """World of the poses: z up, camera-like (y down), or find out."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
+    camera: str | None = None
+    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    antenna_m: Triple | None = None
+    """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
     max_pose_gap_s: Positive = 1.0

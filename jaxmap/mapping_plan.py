@@ -97,6 +97,8 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         poses=config.poses,
         poses_world=config.poses_world,
         calibration=config.calibration,
+        camera=config.camera,
+        antenna_m=config.antenna_m,
         start=config.start,
         stop=config.stop,
         stride=config.stride,

@@ -8,14 +8,9 @@ from typing import Any, Generic, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from jaxmap.errors import UsageError
+from jaxmap.files import config_folder
 
 Config = TypeVar("Config")
-
-
-def config_folder() -> Path:
-    """The folder of configurations that come with jaxmap."""
-    packaged = Path(__file__).parent / "configs"
-    return packaged if packaged.is_dir() else Path(__file__).parents[1] / "configs"
 
 
 class Settings(Generic[Config]):

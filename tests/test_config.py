@@ -25,11 +25,11 @@ from jaxmap.config import (
 )
 from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.errors import UsageError
+from jaxmap.files import config_folder
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.labellers import make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
-from jaxmap.settings import config_folder
 from jaxmap.stereo.options import StereoOptions
 
 CONFIGS = sorted(config_folder().glob("*.yaml"))

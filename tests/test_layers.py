@@ -19,6 +19,7 @@ FLOORS = {
     "jaxmap.prefetch": 0,
     # 1: pure geometry, host stereo, networks
     "jaxmap.geometry": 1,
+    "jaxmap.localisation": 1,
     "jaxmap.stereo": 1,
     "jaxmap.models": 1,
     # 2: evidence

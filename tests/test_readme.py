@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxmap.commands import COMMANDS
 from jaxmap.datasets import READERS
-from jaxmap.settings import config_folder
+from jaxmap.files import config_folder
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf8")
