@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxmap.errors import JaxmapError
 from jaxmap.models.architecture import Architecture
@@ -91,36 +91,41 @@ def map_pixels(
         The images (H, W) that the function gives.
     """
     height, width = len(places.rows), len(places.columns)
-    blocks = -(-height // _BLOCK_ROWS)
-    rows = np.pad(places.rows, ((0, blocks * _BLOCK_ROWS - height), (0, 0)))
-    lines = jnp.einsum("Hh,hwc->Hcw", rows, coarse, precision=PRECISION)
-    bands = _bands(places.columns)
+    rows, columns = _bands(places.rows, _BLOCK_ROWS), _bands(places.columns, _BLOCK_COLUMNS)
+    # Classes between rows and columns: softmax and maximum over them are fastest there.
+    coarse = jnp.swapaxes(coarse, 1, 2)
 
     # On the way back the logits are computed anew, so that they are never all held there either.
     @jax.checkpoint
-    def block(lines: Float[Array, "R C w"]) -> tuple[Array, ...]:
-        parts = [jnp.dot(lines[..., band.pixels], band.weights, precision=PRECISION) for band in bands]
+    def block(band: tuple[Int[Array, ""], Float[Array, "R near"]]) -> tuple[Array, ...]:
+        start, weights = band
+        near = jax.lax.dynamic_slice_in_dim(coarse, start, weights.shape[1])
+        lines = jnp.einsum("Rn,ncw->Rcw", weights, near, precision=PRECISION)
+        parts = [
+            jnp.dot(lines[..., first : first + columns.weights.shape[2]], weights.T, precision=PRECISION)
+            for first, weights in zip(columns.starts, columns.weights, strict=True)
+        ]
         logits = jnp.concatenate(parts, axis=-1)[..., :width]
         # Without the barrier they would be computed anew for each use.
         return function(jax.lax.optimization_barrier(logits))
 
-    images = jax.lax.map(block, lines.reshape(blocks, _BLOCK_ROWS, *lines.shape[1:]))
+    images = jax.lax.map(block, (jnp.asarray(rows.starts), jnp.asarray(rows.weights)))
     return tuple(image.reshape(-1, width)[:height] for image in images)
 
 
-class _Band(NamedTuple):
-    """Some neighbouring pixels of a row: the coarse ones that they depend on, and how."""
+class _Bands(NamedTuple):
+    """The rows of a matrix in bands, without most of the zeros: the column where each band starts, and its numbers."""
 
-    pixels: slice
-    weights: Float[np.ndarray, "near targets"]
+    starts: Int[np.ndarray, "bands"]
+    weights: Float[np.ndarray, "bands size near"]
 
 
-def _bands(columns: Float[np.ndarray, "W w"]) -> list[_Band]:
-    """The matrix of the columns without most of its zeros: a pixel depends on two or three coarse ones."""
-    bands = []
-    for start in range(0, len(columns), _BLOCK_COLUMNS):
-        weights = columns[start : start + _BLOCK_COLUMNS]
-        met = np.flatnonzero(weights.any(axis=0))
-        pixels = slice(int(met[0]), int(met[-1]) + 1)
-        bands.append(_Band(pixels, np.ascontiguousarray(weights[:, pixels].T)))
-    return bands
+def _bands(matrix: Float[np.ndarray, "pixels coarse"], size: int) -> _Bands:
+    """Cuts the matrix of an axis: neighbouring pixels depend on few coarse ones, and those are neighbours."""
+    missing = -len(matrix) % size
+    blocks = np.pad(matrix, ((0, missing), (0, 0))).reshape(-1, size, matrix.shape[1])
+    met = [np.flatnonzero(block.any(axis=0)) for block in blocks]
+    near = max(int(index[-1] - index[0]) + 1 for index in met)
+    starts = np.array([min(int(index[0]), matrix.shape[1] - near) for index in met], np.int32)
+    weights = [block[:, start : start + near] for start, block in zip(starts, blocks, strict=True)]
+    return _Bands(starts, np.stack(weights))

@@ -49,7 +49,7 @@ def test_the_matrix_of_an_axis_resizes_it(source, target, align_corners):
 
 
 def test_nothing_is_resized_where_no_size_is_given():
-    image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(1, 2, 3, 3)
+    image = jnp.zeros((1, 2, 3, 3), jnp.uint8)
     assert resized_input(image, None) is image
     logits = jnp.asarray(np.random.default_rng(0).normal(size=(1, 4, 5, 2)), jnp.float32)
     np.testing.assert_array_equal(resized_output(logits, (4, 5)), logits)
@@ -65,7 +65,7 @@ def test_the_logits_of_all_pixels_are_never_held_at_once():
     everything = 4 * 384 * 512 * 21
     for function in (likeliest, jax.grad(lambda coarse: likeliest(coarse).sum())):
         memory = jax.jit(function).lower(coarse).compile().memory_analysis()
-        assert memory.temp_size_in_bytes < everything / 2
+        assert memory.temp_size_in_bytes < everything / 4
 
 
 @pytest.mark.parametrize("size_px", [(0, 4), (4, -1)])
