@@ -80,7 +80,9 @@ def _read(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, np.ndarray]:
     for name, value in content.items():
         if isinstance(name, str) and isinstance(value, StoredTensor) and "f" in value.storage.dtype:
             if (size := value.storage.bytes) > file_bytes:
-                raise Refused(f"storage {short(value.storage.key)} is said to hold {short(size)} bytes, the file is smaller")
+                raise Refused(
+                    f"storage {short(value.storage.key)} is said to hold {short(size)} bytes, the file is smaller"
+                )
             total += value.check()
             if total > MAX_SHARING * file_bytes:
                 raise Refused("tensors that share their numbers many times over")

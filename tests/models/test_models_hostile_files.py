@@ -74,7 +74,9 @@ def tensor(count: int, key: str = "0", storage: str = "FloatStorage") -> bytes:
     )
 
 
-DOUBLING = b"K\x01q\x00" + b"".join(b"h" + bytes([n]) + b"h" + bytes([n]) + b"\x86q" + bytes([n + 1]) for n in range(80))
+DOUBLING = b"K\x01q\x00" + b"".join(
+    b"h" + bytes([n]) + b"h" + bytes([n]) + b"\x86q" + bytes([n + 1]) for n in range(80)
+)
 """Pairs of pairs of pairs: a value that is small to keep and endless to walk through."""
 
 HOSTILE = {
