@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import threading
 from dataclasses import replace
 from functools import partial
@@ -167,8 +168,8 @@ def test_weights_are_fetched_checked_and_kept(cli, server, tmp_path, monkeypatch
 
 def test_the_table_of_public_weights_is_well_formed():
     for public in weight_files.PUBLIC.values():
-        assert public.url.startswith("https://") and len(public.sha256) >= 8
-        assert public.sha256[:8] in public.url
+        assert public.url.startswith("https://") and re.fullmatch("[0-9a-f]{64}", public.sha256)
+        assert public.url.endswith(f"-{public.sha256[:8]}.pth")
 
 
 @pytest.mark.realdata
