@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 PRECISION = jax.lax.Precision.HIGHEST
@@ -88,8 +89,8 @@ def _depthwise_backward(
     of_kernel = jax.lax.platform_dependent(
         images,
         cotangent,
-        cpu=partial(_kernel_gradient_by_rows, sliding=sliding),
-        default=partial(_kernel_gradient, sliding=sliding),
+        cpu=partial(kernel_gradient_by_rows, sliding=sliding),
+        default=partial(kernel_gradient, sliding=sliding),
     )
     return _depthwise_images_gradient(cotangent, kernel, sliding, images.shape), of_kernel
 
@@ -128,7 +129,7 @@ def _meeting(sliding: Sliding, index: int, axis: int, size: int, count: int) -> 
     return slice(first + low * stride, max(first + (high - 1) * stride + 1, 0), stride), slice(low, max(high, low))
 
 
-def _kernel_gradient(images: Array, cotangent: Array, *, sliding: Sliding) -> Float[Array, "K K 1 C"]:
+def kernel_gradient(images: Array, cotangent: Array, *, sliding: Sliding) -> Float[Array, "K K 1 C"]:
     """Sum over the pixels that each element met, times what came back from there."""
 
     def one(row: int, column: int) -> Array:
@@ -140,7 +141,7 @@ def _kernel_gradient(images: Array, cotangent: Array, *, sliding: Sliding) -> Fl
     return jnp.stack([jnp.stack([one(row, column) for column in elements]) for row in elements])[:, :, None]
 
 
-def _kernel_gradient_by_rows(images: Array, cotangent: Array, *, sliding: Sliding) -> Float[Array, "K K 1 C"]:
+def kernel_gradient_by_rows(images: Array, cotangent: Array, *, sliding: Sliding) -> Float[Array, "K K 1 C"]:
     """The same, a few rows at a time, which stay in the cache for all elements, summed by matrix products."""
     batch, height, width, channels = images.shape
     rows_out, columns_out = cotangent.shape[1:3]
@@ -166,3 +167,27 @@ def _kernel_gradient_by_rows(images: Array, cotangent: Array, *, sliding: Slidin
     zeros = [jnp.zeros(channels, cotangent.dtype)] * len(elements)
     totals = jax.lax.fori_loop(0, batch // several * rows_out, add_row, zeros)
     return jnp.stack(totals).reshape(sliding.size, sliding.size, 1, channels)
+
+
+def resized(
+    cotangent: Float[Array, "B H W C"], taps: tuple[np.ndarray, np.ndarray, np.ndarray], source: int, axis: int
+) -> Float[Array, "B h w C"]:
+    """The gradient of what was resized along an axis, as a matrix product; autodiff would scatter.
+
+    Args:
+        cotangent: of the resized images.
+        taps: the two source pixels of each target pixel, and the share of the second.
+        source: pixels along the axis before.
+        axis: 1 (rows) or 2 (columns).
+    """
+    low, high, share = taps
+    weights = np.zeros((source, len(low)), np.float32)
+    np.add.at(weights, (low, np.arange(len(low))), 1 - share)
+    np.add.at(weights, (high, np.arange(len(low))), share)
+    batch, height, width, channels = cotangent.shape
+    # A stack of matrices whose rows lie along the axis, without moving a pixel.
+    stack = (batch, height, -1) if axis == 1 else (batch * height, width, channels)
+    rows = cotangent.reshape(stack)
+    matrices = jnp.broadcast_to(jnp.asarray(weights, cotangent.dtype), (len(rows), *weights.shape))
+    result = jnp.matmul(matrices, rows, precision=PRECISION)
+    return result.reshape((batch, source, width, channels) if axis == 1 else (batch, height, source, channels))
