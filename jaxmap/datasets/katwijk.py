@@ -81,9 +81,8 @@ def open_katwijk(folder: Path, options: ReadOptions) -> StereoSequence:
     times_s = np.array([frame.timestamp_s for frame in pairs.frames])
     if options.poses:
         track, T_child_camera = read_pose_track(options, None, options.poses), None
-        crs, told = (
-            (CRS, []) if _looks_like_utm(track) else (None, ["the poses given are not UTM: --crs says what they are"])
-        )
+        crs = CRS if _looks_like_utm(track) else None
+        told = [] if crs else ["the poses given are not UTM: --crs says what they are"]
     else:
         track, crs, told = _estimated_track(folder, options, times_s)
         T_child_camera, told_by_mount = body_to_camera(folder, camera, times_s)
@@ -154,12 +153,13 @@ def _looks_like_utm(track: PoseTrack) -> bool:
 
 
 def _is_part(folder: Path) -> bool:
-    return any((folder / camera.folder).is_dir() for camera in CAMERAS.values())
+    # Unlike Path.is_dir, this does not raise where the folder may not be looked into.
+    return any(os.path.isdir(folder / camera.folder) for camera in CAMERAS.values())
 
 
 def _subfolders(folder: Path) -> list[Path]:
     try:
-        found = [path for path in folder.iterdir() if path.is_dir()]
+        found = [path for path in folder.iterdir() if os.path.isdir(path)]
     except OSError:
         return []
     return sorted(found, key=lambda path: [word.zfill(9) for word in re.findall(r"[0-9]+|[^0-9]+", path.name)])

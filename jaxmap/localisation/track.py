@@ -46,7 +46,7 @@ class Track(NamedTuple):
     Attributes:
         position_m: (K, 3), of the IMU in the world.
         heading_rad: (K,), from east towards north, continuous.
-        heading_sigma_rad: at the first, middle and last knot, the greatest.
+        heading_sigma_rad: the median over the way.
         wheel_scale: the mean over the way.
         outliers: how many fixes lay beyond the bound of the robust loss.
     """
@@ -87,8 +87,8 @@ def estimate_track(
         state += step
         if iteration > 2 and np.abs(step[:, : HEADING + 1]).max() < 1e-5:
             break
-    some = np.array([0, len(state) // 2, len(state) - 1])
-    heading_sigma_rad = terms.linearise(state, robust=True).sigma(some, HEADING).max()
+    some = np.linspace(0, len(state) - 1, 9).astype(int)
+    heading_sigma_rad = np.median(terms.linearise(state, robust=True).sigma(some, HEADING))
     height = turned(levelled(np.array([0.0, 0.0, geometry.height_m]), tilt), state[:, HEADING])
     return Track(
         position_m=state[:, :3] + height + terms.origin_m,
