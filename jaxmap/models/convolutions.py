@@ -172,12 +172,10 @@ def resize_bilinear(
     return _resize_axis(_resize_axis(images, height, 1, align_corners), width, 2, align_corners)
 
 
-def resize_matrix(source: int, target: int, *, align_corners: bool) -> Float[np.ndarray, "target source"]:
-    """What `resize_bilinear` does along one axis, as a matrix from the pixels there to those wanted."""
-    low, high, share = _resize_taps(source, target, align_corners)
-    matrix = np.zeros((target, source))
-    rows = np.arange(target)
-    # Added, not set: at the border both taps are the same pixel.
-    np.add.at(matrix, (rows, low), 1.0 - share.astype(np.float64))
-    np.add.at(matrix, (rows, high), share.astype(np.float64))
-    return matrix
+def resize_rows(matrix: Float[np.ndarray, "source N"], target: int, *, align_corners: bool) -> np.ndarray:
+    """What `resize_bilinear` does along one axis, on the host: (target, N), as precise as the matrix.
+
+    The identity becomes the matrix that takes the pixels there to those wanted.
+    """
+    low, high, share = _resize_taps(len(matrix), target, align_corners)
+    return matrix[low] + (matrix[high] - matrix[low]) * share[:, None]

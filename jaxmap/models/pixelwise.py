@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from jaxmap.errors import JaxmapError
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.convolutions import PRECISION, resize_bilinear, resize_matrix
+from jaxmap.models.convolutions import PRECISION, resize_bilinear, resize_rows
 from jaxmap.models.deeplab import Images, padded_size
 
 Size = tuple[int, int]
@@ -71,8 +71,8 @@ def upsampling(
     def along(axis: int) -> np.ndarray:
         inside = image_px[axis] if size_px is None else size_px[axis]
         padded = padded_size(inside, architecture)
-        last = resize_matrix(coarse[axis], padded, align_corners=architecture.align_corners)[:inside]
-        return (resize_matrix(inside, image_px[axis], align_corners=False) @ last).astype(np.float32)
+        matrix = resize_rows(np.eye(coarse[axis]), padded, align_corners=architecture.align_corners)[:inside]
+        return resize_rows(matrix, image_px[axis], align_corners=False).astype(np.float32)
 
     return Upsampling(along(0), along(1))
 
@@ -103,7 +103,7 @@ def map_pixels(
         lines = jnp.einsum("Rn,ncw->Rcw", weights, near, precision=PRECISION)
         parts = [
             jnp.dot(lines[..., first : first + columns.weights.shape[2]], weights.T, precision=PRECISION)
-            for first, weights in zip(columns.starts, columns.weights, strict=True)
+            for first, weights in zip(columns.starts.tolist(), columns.weights, strict=True)
         ]
         logits = jnp.concatenate(parts, axis=-1)[..., :width]
         # Without the barrier they would be computed anew for each use.
