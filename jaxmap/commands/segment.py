@@ -79,10 +79,10 @@ def _label(arguments: SegmentArguments, segmenter: Segmenter, images: list[Path]
                 labelled = label_image(segmenter, image)
             except FrameError as fault:
                 faults.append(fault)
-                continue
-            write_labelled(labelled, segmenter.classes, arguments.out, save_logits=arguments.save_logits)
-            if masks:
-                score_image(scores, labelled, masks[index])
+            else:
+                write_labelled(labelled, segmenter.classes, arguments.out, save_logits=arguments.save_logits)
+                if masks:
+                    score_image(scores, labelled, masks[index])
             advance(index + 1)
     if masks:
         _tell_scores(console, scores.summary(), arguments.scores)
