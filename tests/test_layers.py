@@ -44,6 +44,7 @@ FLOORS = {
     "jaxmap.training_config": 6,
     "jaxmap.config": 6,
     "jaxmap.cache": 6,
+    "jaxmap.host_memory": 6,
     # 7: runs
     "jaxmap.output_folder": 7,
     "jaxmap.training_folder": 7,
