@@ -45,6 +45,7 @@ FLOORS = {
     "jaxmap.mapping": 7,
     "jaxmap.mapping_plan": 7,
     "jaxmap.segmentation": 7,
+    "jaxmap.map_evaluation": 7,
     "jaxmap.weight_files": 7,
     # 8: the command line
     "jaxmap.commands": 8,
@@ -66,6 +67,7 @@ SAME_FLOOR = {
     ("jaxmap.mapping", "jaxmap.run_folder"),
     ("jaxmap.run_folder", "jaxmap.mapping_plan"),
     ("jaxmap.mapping", "jaxmap.run_outputs"),
+    ("jaxmap.map_evaluation", "jaxmap.run_folder"),
     ("jaxmap.cli", "jaxmap.commands"),
     ("jaxmap.__main__", "jaxmap.cli"),
 }
