@@ -193,6 +193,6 @@ def summary(scores: dict[str, Any]) -> str:
     within = "" if scores["max_range_m"] is None else f" within {scores['max_range_m']:g} m"
     return (
         f"{frames}{scores['cells']:,} cells of {scores['cell_size_m']:g} m observed and labelled{within}, "
-        f"{scores['rock_cells']:,} of them {scores['class']}; {scores['rocks']['count']} in view, "
+        f"{scores['rock_cells']:,} of them {scores['class']}; {scores['rocks']['count']} rocks in view, "
         f"{scores['rocks']['missed']} missed"
     )

@@ -32,7 +32,7 @@ class EvaluateArguments:
     target: Annotated[str, tyro.conf.arg(name="class")] = "rock"
     """The class that is scored."""
     rock_fraction: float = 0.5
-    """A cell is rock where rock covers this share of its labelled area; in the map, of its observed area."""
+    """A cell is rock where rock covers this share: in the truth of its labelled area, in the map of its area."""
     cell_size_m: float = 0.2
     """Edge of a cell."""
     max_range_m: float | None = None

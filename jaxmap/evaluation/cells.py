@@ -1,7 +1,8 @@
 """The cells that maps are scored in, and what a map says of each: the one place that defines it.
 
-A cell may hold any number of columns of voxels, whole or in part. All is counted by area, so that the size of
-the voxels does not matter; columns where no surface was observed have no say.
+A cell may hold any number of columns of voxels, whole or in part. All is counted by area, because a rock's steep
+face throws many points into a cell that it hardly covers. Ground that was not observed is not rock, and of it a
+map says its prior: a few stray points do not make a cell.
 """
 
 from __future__ import annotations
@@ -48,19 +49,21 @@ AnyArray = Array | np.ndarray
 class ColumnShares(NamedTuple):
     """How much of each column of voxels lies in each cell, as a share of the column's width along each axis.
 
-    The share of its area is the product of the two.
+    The share of its area is the product of the two. `columns_per_cell` is how many columns fill a cell, whole or in
+    part.
     """
 
     x: Float[np.ndarray, "I X"]
     y: Float[np.ndarray, "J Y"]
+    columns_per_cell: float
 
 
 class MapCells(NamedTuple):
     """What a map says of each cell.
 
-    `observed`: a surface was seen in some column of it; `share`: of the observed area, that of the columns
-    labelled with the class; `probability`: that a point of the observed area is of the class, the mean over its
-    columns; `share` is 0 and `probability` the class prior where nothing was observed.
+    `observed`: a surface was seen in some column of it; `share`: of its area, that of the columns labelled with the
+    class; `probability`: that a point of it is of the class, the mean over its area, the class prior where nothing
+    was observed.
     """
 
     observed: Bool[AnyArray, "I J"]
@@ -68,7 +71,7 @@ class MapCells(NamedTuple):
     probability: Float[AnyArray, "I J"]
 
     def called(self, fraction: float = 0.5) -> Bool[np.ndarray, "I J"]:
-        """Cells that the map calls by the class: it covers at least `fraction` of their observed area."""
+        """Cells that the map calls by the class: it covers at least `fraction` of their area."""
         return np.asarray(self.observed) & (np.asarray(self.share) >= fraction - _SNAP)
 
 
@@ -102,7 +105,7 @@ def column_shares(grid: GridSpec, cells: CellGrid) -> ColumnShares:
         low = origin_m[axis] + np.arange(grid.shape[axis]) * voxel_m[axis]
         overlap = np.minimum(edges[1:], low + voxel_m[axis]) - np.maximum(edges[:-1], low)
         shares.append(np.round(overlap.clip(min=0) / voxel_m[axis], 6).astype(np.float32))
-    return ColumnShares(*shares)
+    return ColumnShares(*shares, columns_per_cell=float(np.prod(cells.size_m / voxel_m[:2])))
 
 
 def area_in_cells(shares: ColumnShares, columns: Float[AnyArray, "X Y"]) -> Float[Array, "I J"]:
@@ -129,12 +132,11 @@ def map_cells(
         prior: probability of the class where nothing was observed.
     """
     weight = jnp.asarray(observed, jnp.float32)
-    area = area_in_cells(shares, weight)
-    seen = area > _SNAP
-    safe = jnp.where(seen, area, 1.0)
-    share = area_in_cells(shares, jnp.where(observed, is_class, 0.0).astype(jnp.float32)) / safe
-    mean = area_in_cells(shares, jnp.where(observed, probability, 0.0)) / safe
-    return MapCells(seen, jnp.where(seen, share, 0.0), jnp.where(seen, mean, prior))
+    area = area_in_cells(shares, weight) / shares.columns_per_cell
+    share = area_in_cells(shares, weight * is_class) / shares.columns_per_cell
+    # Selected, not multiplied: a probability that is not finite where nothing was observed must not spread.
+    known = area_in_cells(shares, jnp.where(observed, probability, 0.0)) / shares.columns_per_cell
+    return MapCells(area > _SNAP, share, known + (1.0 - area) * prior)
 
 
 def _whole(numbers: np.ndarray) -> bool:

@@ -12,8 +12,8 @@ from jaxmap.datasets.crs import Extent
 from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import CellGrid, MapCells, area_in_cells, column_shares, make_cells, map_cells
-from jaxmap.evaluation.map_scores import score_cells
-from jaxmap.evaluation.registration import Registration, register
+from jaxmap.evaluation.map_scores import confusion_scores, count_confusion, score_cells
+from jaxmap.evaluation.registration import register, soft_iou
 from jaxmap.evaluation.rocks import find_rocks, rock_table
 from jaxmap.evaluation.truth_cells import Alignment, TruthCells, truth_cells
 from jaxmap.evaluation.views import Views, ground_height, view_range
@@ -64,7 +64,7 @@ class ScoringOptions:
     Attributes:
         cell_size_m: edge of a cell.
         rock_fraction: a cell is of the class where it covers at least this share of its labelled area in the truth,
-            and is called so where it covers at least this share of its observed area in the map.
+            and is called so where columns of the class cover at least this share of its area in the map.
         max_range_m: only cells that a camera looked at from so near count; by default all that were observed.
         register: move the truth to where it fits best first.
         found_share: a rock is found where this share of its area lies in cells called rock.
@@ -130,52 +130,61 @@ def evaluate_map(
     if options.max_range_m is not None and views is None:
         raise JaxmapError("a range needs the poses and the camera of the map", where="max_range_m", fix="give views")
     ground = _ground_cells(class_map, make_cells(class_map.grid, options.cell_size_m))
-    max_range_m = options.max_range_m or (views.max_range_m if views else np.inf)
+    view_range_m = options.max_range_m or (views.max_range_m if views else np.inf)
     range_m = np.full(ground.cells.shape, np.inf)
     in_view = np.ones(ground.cells.shape, bool)
     if views is not None:
-        range_m = view_range(ground.cells, ground.height_m, views, max_range_m)
+        range_m = view_range(ground.cells, ground.height_m, views, view_range_m)
         in_view = np.isfinite(range_m)
     here, cells = _around(ground.cells, in_view | np.asarray(ground.said.observed))
     said = MapCells(*(np.asarray(leaf)[here] for leaf in ground.said))
     observed, range_m, in_view = np.asarray(said.observed), range_m[here], in_view[here]
     asked = observed & (in_view if options.max_range_m is not None else True)
 
-    registration = _registered(class_map, raster, cells, said, asked) if options.register else None
-    alignment = registration.alignment if registration else Alignment()
-    truth = truth_cells(raster, cells, class_map.site_origin, class_map.crs, alignment=alignment)
+    called = said.called(options.rock_fraction)
+    before, alignment = _placed(class_map, raster, cells), Alignment()
+    truth = before
+    if options.register:
+        alignment = _best_alignment(class_map, raster, cells, said, asked, options.rock_fraction)
+        truth = _placed(class_map, raster, cells, alignment)
     counted, domain = asked & truth.labelled, in_view & truth.labelled
     if not counted.any():
-        within = f" within {max_range_m:g} m" if options.max_range_m is not None else ""
-        raise JaxmapError(
-            f"no observed cell{within} is labelled: {int(asked.sum())} were observed, {int(truth.labelled.sum())} are "
-            "labelled",
-            where=raster.name,
-            fix="check that both are of one site, and the coding of the labels",
-        )
-    called, truly = said.called(options.rock_fraction), truth.truly(options.rock_fraction)
-    scores = _scores(said, called, truly, counted, domain)
-    scores |= {
+        raise _nothing_counted(int(asked.sum()), int(truth.labelled.sum()), options.max_range_m, raster.name)
+    truly = truth.truly(options.rock_fraction)
+    scores = _scores(said, called, truly, counted, domain) | {
         "cells": int(counted.sum()),
         "rock_cells": int((truly & counted).sum()),
         "frames": None if views is None else len(views.T_world_camera),
         "rocks": rock_table(find_rocks(truth, cells.size_m, called, domain, range_m), options.found_share),
         "cell_size_m": options.cell_size_m,
         "rock_fraction": options.rock_fraction,
-        "max_range_m": None if np.isinf(max_range_m) else float(max_range_m),
+        "max_range_m": options.max_range_m,
+        "view_range_m": None if np.isinf(view_range_m) else float(view_range_m),
     }
-    if registration is not None:
-        before = truth_cells(raster, cells, class_map.site_origin, class_map.crs)
-        scores["registration"] = _told(registration) | {
-            "before": _scores(
-                said,
-                called,
-                before.truly(options.rock_fraction),
-                asked & before.labelled,
-                in_view & before.labelled,
-            )
+    if options.register:
+        unmoved = before.truly(options.rock_fraction)
+        scores["registration"] = _told(alignment) | {
+            "before": _scores(said, called, unmoved, asked & before.labelled, in_view & before.labelled)
         }
     return Evaluation(scores, cells, observed, called, truly, counted, domain, truth, alignment)
+
+
+def _nothing_counted(asked: int, labelled: int, max_range_m: float | None, where: str) -> JaxmapError:
+    within = "" if max_range_m is None else f" within {max_range_m:g} m"
+    return JaxmapError(
+        f"no observed cell is labelled: {asked} cells were observed{within}, {labelled} are labelled",
+        where=where,
+        fix="check that both are of one site, and the coding of the labels",
+    )
+
+
+def _told(alignment: Alignment) -> dict[str, Any]:
+    return {
+        "shift_east_m": alignment.shift_m[0],
+        "shift_north_m": alignment.shift_m[1],
+        "heading_deg": float(np.rad2deg(alignment.heading_rad)),
+        "pivot_m": list(alignment.pivot_m),
+    }
 
 
 class _Ground(NamedTuple):
@@ -218,33 +227,34 @@ def _scores(
     return over_counted | {"coverage": in_view["coverage"], "in_view": in_view}
 
 
-def _registered(
-    class_map: ClassMap, raster: LabelRaster, cells: CellGrid, said: MapCells, asked: np.ndarray
-) -> Registration:
+def _placed(
+    class_map: ClassMap,
+    raster: LabelRaster,
+    cells: CellGrid,
+    alignment: Alignment | None = None,
+    per_cell: int | None = None,
+) -> TruthCells:
+    return truth_cells(raster, cells, class_map.site_origin, class_map.crs, alignment=alignment, per_cell=per_cell)
+
+
+def _best_alignment(
+    class_map: ClassMap, raster: LabelRaster, cells: CellGrid, said: MapCells, asked: np.ndarray, fraction: float
+) -> Alignment:
+    """The motion at which IoU and its smooth sister are greatest together; none where the IoU does not gain."""
     x, y = cells.centres()
     seen = np.argwhere(asked)
     middle = seen.mean(axis=0).round().astype(int) if len(seen) else np.zeros(2, int)
+    pivot_m = (float(x[middle[0]]), float(y[middle[1]]))
+    called, share = said.called(fraction), np.asarray(said.share)
 
-    def shares(alignment: Alignment) -> tuple[np.ndarray, np.ndarray]:
-        moved = truth_cells(
-            raster,
-            cells,
-            class_map.site_origin,
-            class_map.crs,
-            alignment=alignment,
-            per_cell=_SEARCH_SAMPLES,
-        )
-        return moved.share, moved.labelled
+    def iou(truth: TruthCells) -> float:
+        return confusion_scores(count_confusion(called, truth.truly(fraction), asked & truth.labelled))["iou"] or 0.0
 
-    return register(np.asarray(said.share), asked, shares, (float(x[middle[0]]), float(y[middle[1]])))
+    def overlap(alignment: Alignment) -> float:
+        moved = _placed(class_map, raster, cells, alignment, _SEARCH_SAMPLES)
+        return iou(moved) + soft_iou(share, moved.share, asked & moved.labelled)
 
-
-def _told(registration: Registration) -> dict[str, Any]:
-    alignment = registration.alignment
-    return {
-        "shift_east_m": alignment.shift_m[0],
-        "shift_north_m": alignment.shift_m[1],
-        "heading_deg": float(np.rad2deg(alignment.heading_rad)),
-        "soft_iou_before": registration.overlap_before,
-        "soft_iou": registration.overlap,
-    }
+    best, still = register(overlap, pivot_m), Alignment(pivot_m=pivot_m)
+    # The search samples the truth coarsely: what counts is the score itself.
+    gains = iou(_placed(class_map, raster, cells, best)) > iou(_placed(class_map, raster, cells, still))
+    return best if gains else still
