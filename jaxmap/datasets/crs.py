@@ -40,9 +40,8 @@ class Extent(NamedTuple):
         return Extent(self.west - margin, self.south - margin, self.east + margin, self.north + margin, self.crs)
 
     def text(self) -> str:
-        """The box in words; degrees keep more digits than metres."""
-        digits = 6 if max(map(abs, self[:4])) <= 360 else 1
-        west, south, east, north = (f"{value:.{digits}f}" for value in self[:4])
+        """The box in words."""
+        west, south, east, north = (f"{value:.9g}" for value in self[:4])
         return f"{west} to {east} east, {south} to {north} north"
 
 
