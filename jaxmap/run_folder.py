@@ -98,6 +98,8 @@ class RunFolder:
         self.metrics = path / "metrics.json"
         self.config = path / "config.yaml"
         self.poses = path / "poses.tum"
+        self.scores = path / "scores.json"
+        self.errors = path / "errors.png"
         self.pictures = path / "pictures"
 
     def locked(self) -> AbstractContextManager[None]:
@@ -128,7 +130,10 @@ class RunFolder:
 
     @property
     def _files(self) -> tuple[Path, ...]:
-        return (self.ply, self.geotiff, self.picture, self.metrics, self.poses, self.path / "report.html", self.config)
+        report = self.path / "report.html"
+        # Scores are of the map that is there: they go with it.
+        scored = (self.scores, self.errors)
+        return (self.ply, self.geotiff, self.picture, self.metrics, self.poses, report, self.config, *scored)
 
     def check_apart(self, plan: Plan, config: MapConfig) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.

@@ -56,6 +56,7 @@ FLOORS = {
     "jaxmap.mapping": 7,
     "jaxmap.mapping_plan": 7,
     "jaxmap.segmentation": 7,
+    "jaxmap.map_evaluation": 7,
     "jaxmap.weight_files": 7,
     # 8: the command line
     "jaxmap.commands": 8,
@@ -84,11 +85,13 @@ SAME_FLOOR = {
     ("jaxmap.training_run", "jaxmap.training_plan"),
     ("jaxmap.run_folder", "jaxmap.output_folder"),
     ("jaxmap.mapping", "jaxmap.output_folder"),
+    ("jaxmap.map_evaluation", "jaxmap.output_folder"),
     ("jaxmap.run_outputs", "jaxmap.run_folder"),
     ("jaxmap.mapping", "jaxmap.mapping_plan"),
     ("jaxmap.mapping", "jaxmap.run_folder"),
     ("jaxmap.run_folder", "jaxmap.mapping_plan"),
     ("jaxmap.mapping", "jaxmap.run_outputs"),
+    ("jaxmap.map_evaluation", "jaxmap.run_folder"),
     ("jaxmap.cli", "jaxmap.commands"),
     ("jaxmap.__main__", "jaxmap.cli"),
 }
