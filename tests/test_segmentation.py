@@ -97,7 +97,7 @@ def test_faults_are_one_line_and_nothing_is_written(cli, model, images, tmp_path
     assert "label 3, but there are 3 classes" in cli(*words, "--masks", masks).error
     assert "no such file" in cli("segment", tmp_path / "no.png", "--model", model, "--out", out).error
     assert "same name" in cli("segment", images, images / "a.png", "--model", model, "--out", out).error
-    assert "no such file" in cli("segment", images, "--model", tmp_path / "no.safetensors", "--out", out).error
+    assert "no such model file" in cli("segment", images, "--model", tmp_path / "no.safetensors", "--out", out).error
     outcome = cli(*words, "--scores", tmp_path / "scores.json")
     assert outcome.status == 2 and "--masks" in outcome.error
     assert not out.exists()

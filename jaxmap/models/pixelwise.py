@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import UsageError
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.convolutions import PRECISION, resize_bilinear, resize_rows
 from jaxmap.models.deeplab import Images, padded_size
@@ -30,10 +30,10 @@ def check_size(size_px: Size | None, where: object) -> None:
     """Refuses a size that no image can have.
 
     Raises:
-        JaxmapError: the height or the width is below 1.
+        UsageError: the height or the width is below 1.
     """
     if size_px is not None and min(size_px) < 1:
-        raise JaxmapError(f"size {size_px[0]} {size_px[1]}", where=where, fix="give a height and a width above 0")
+        raise UsageError(f"size {size_px[0]} {size_px[1]}", where=where, fix="give a height and a width above 0")
 
 
 def resized_input(images: Images, size_px: Size | None) -> UInt8[Array, "B h w 3"] | Float[Array, "B h w 3"]:

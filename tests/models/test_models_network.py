@@ -153,5 +153,5 @@ def test_faults_of_an_architecture_are_told_together():
     faulty = replace(SMALL, backbone="vgg", output_stride=4, classes=("a", "a"), std=(1.0, 0.0, 1.0))
     with pytest.raises(JaxmapError) as caught:
         check_architecture(faulty)
-    for word in ("vgg", "output_stride 4", "different names", "std"):
+    for word in ("vgg", "output_stride 4", "different printable names", "std"):
         assert word in str(caught.value)
