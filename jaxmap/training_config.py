@@ -6,11 +6,15 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar
 
 from annotated_types import Interval
+from pydantic import BeforeValidator
 
 from jaxmap.settings import Settings
 from jaxmap.training.options import NetworkOptions, TrainingOptions
 
 _STRICT: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
+
+Value = Annotated[str, BeforeValidator(str)]
+"""A value of the masks as text: YAML reads a number, JSON and the command line text."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,7 @@ class DataConfig:
 
     __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
 
-    remap: dict[int | str, str] | None = None
+    remap: dict[Value, str] | None = None
     """Class by value of the masks, such as 255 rock; "ignore" is no class, and the value * every other."""
     palette: dict[str, str] | None = None
     """Colour of the masks by class, such as rock #ff0000; several of a class with blanks between."""

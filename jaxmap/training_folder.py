@@ -48,25 +48,23 @@ class TrainingFolder:
             **train_config_tree(plan.config),
         }
         outputs = (self.model, self.history, self.metrics, self.report, self.config)
-        is_run = self.checkpoints.is_dir() and self.config.is_file()
-        if is_run and resume:
-            check_same_settings(self.config, tree)
-            return
-        foreign = (
-            [] if is_run or self._begun() else [path.name for path in (*outputs, self.checkpoints) if path.exists()]
-        )
-        if foreign:
+        there = [path.name for path in (*outputs, self.checkpoints) if path.exists()]
+        if there and not self._begun():
             raise JaxmapError(
-                f"{', '.join(foreign)} would be replaced, but no training has written them",
+                f"{', '.join(there)} would be replaced, but no training has written them",
                 where=self.path,
                 fix="choose another --out",
             )
-        if is_run and not overwrite:
-            raise JaxmapError(
-                "the folder holds a training run already",
-                where=self.path,
-                fix="go on with it (--resume), replace it (--overwrite), or choose another folder",
-            )
+        if resume and self.checkpoints.is_dir():
+            check_same_settings(self.config, tree)
+            return
+        worth_keeping = (self.model, self.history, self.checkpoints)
+        if not overwrite and any(path.exists() for path in worth_keeping):
+            what, fix = "the folder holds a training run already", "go on with it (--resume), "
+            if resume:
+                what, fix = "the training run in the folder has lost its checkpoints", ""
+            fix += "replace it (--overwrite), or choose another folder"
+            raise JaxmapError(what, where=self.path, fix=fix)
         inputs = {path.resolve() for path in (plan.init,) if path is not None}
         for path in outputs:
             if path.resolve() in inputs:
@@ -76,7 +74,7 @@ class TrainingFolder:
         write_yaml(self.config, tree)
 
     def _begun(self) -> bool:
-        """Whether a run has begun here that has saved nothing yet."""
+        """Whether it was a training run that wrote the settings here."""
         try:
             return self.config.read_text(encoding="utf8").startswith("training_data:")
         except (OSError, UnicodeDecodeError):

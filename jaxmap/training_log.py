@@ -50,6 +50,7 @@ class Meter:
 
     def __init__(self) -> None:
         self._started_s, self._infos, self._images = time.perf_counter(), [], 0
+        self._lap_s = self._started_s
 
     def add(self, info: StepInfo, images: int) -> str:
         """Takes note of a step; returns a line on how it goes."""
@@ -62,6 +63,11 @@ class Meter:
     def seconds(self) -> float:
         """Since the epoch began."""
         return time.perf_counter() - self._started_s
+
+    def lap_s(self) -> float:
+        """Seconds since the last call, or since the epoch began."""
+        before, self._lap_s = self._lap_s, time.perf_counter()
+        return round(self._lap_s - before, 3)
 
     def means(self) -> dict[str, float]:
         """Of the epoch."""

@@ -71,6 +71,9 @@ def plan_training(
     low, high = config.augmentation.scale
     if low > high:
         raise UsageError(f"augmentation.scale is {low} {high}", fix="give the least factor first")
+    losses = config.loss
+    if not (losses.cross_entropy or losses.soft_iou or losses.lovasz):
+        raise UsageError("every loss has a weight of 0", where="--loss", fix="give one of them a weight")
     devices = jax.local_device_count()
     if config.batch_size % devices:
         raise UsageError(
@@ -80,7 +83,7 @@ def plan_training(
     training_set = open_training_set(
         folder,
         config.classes,
-        remap=config.data.remap,
+        remap=config.data.remap,  # type: ignore[arg-type]
         palette=config.data.palette,  # type: ignore[arg-type]
         validation_share=config.data.validation_share,
         seed=config.seed,

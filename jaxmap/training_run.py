@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import jax
@@ -75,20 +77,42 @@ class TrainingRun:
                 state, info = plan.trainer.step(state, jax.device_put(batch, share.split), key)
                 self._check_finite(info, step, epoch)
                 self._on_step(step + 1, meter.add(info, plan.config.batch_size))
+                if step + 1 < plan.order.epoch_end(epoch):
+                    continue
+                # A batch of more examples than there are ends several epochs.
                 while epoch < plan.config.epochs and step + 1 >= plan.order.epoch_end(epoch):
                     self._end_epoch(epoch, state, meter)
-                    epoch, meter = epoch + 1, Meter()
+                    epoch += 1
+                self._keep(state)
+                meter = Meter()
         except JaxmapError as error:
-            self._status = f"Stopped: {error.what}."
-            self._write_report()
+            self._stop(f"Stopped: {error.what}.")
+            raise
+        except KeyboardInterrupt:
+            place = f"epoch {min(epoch + 1, plan.config.epochs)} of {plan.config.epochs}"
+            self._stop(f"Interrupted in {place}.")
+            self._tell(f"interrupted in {place}, which --resume begins again")
             raise
         return metrics_of(self._plan, self._log)
+
+    def _stop(self, status: str) -> None:
+        self._status = status
+        # What stopped the run is told, and not that the page could not be written either.
+        with suppress(JaxmapError):
+            self._write_report()
 
     def _restored(self, state: TrainState) -> TrainState:
         saved = self._checkpoints.restore(state)
         if saved is None:
             return state
-        log = TrainingLog(**saved.record)
+        try:
+            log = TrainingLog(**saved.record)
+        except TypeError as error:
+            raise JaxmapError(
+                "the checkpoints were written by another version of jaxmap",
+                where=self._folder.checkpoints,
+                fix="start anew with --overwrite",
+            ) from error
         if log.digest != self._log.digest:
             raise JaxmapError(
                 "the training data have changed since the run was begun",
@@ -104,8 +128,10 @@ class TrainingRun:
             return
         order = self._plan.order
         images = [self._plan.training_set.train[place // order.variants].name for place in order.draws(step)[:, 1]]
+        loss, norm = float(info.loss), float(info.gradient_norm)
+        numbers = f"loss {loss:g}, gradient norm {norm:g}"
         raise JaxmapError(
-            f"loss {float(info.loss):g}, gradient norm {float(info.gradient_norm):g} in step {step + 1}, "
+            f"{'new weights that are not finite' if math.isfinite(loss + norm) else numbers} in step {step + 1}, "
             f"epoch {epoch + 1}, with the images {', '.join(dict.fromkeys(images))}; what was kept before is there",
             where=self._folder.path,
             fix="look at these images, or take a lower optimiser.learning-rate and start anew from the model",
@@ -115,27 +141,30 @@ class TrainingRun:
         config, last = self._plan.config, epoch + 1 == self._plan.config.epochs
         weights = state.average or state.weights
         row: dict[str, Any] = {"epoch": epoch + 1, "step": int(state.step), **meter.means()}
-        started_s = time.perf_counter()
         if self._validator is not None and ((epoch + 1) % config.validate_every == 0 or last):
             row |= self._validate(epoch, weights)
         elif self._validator is None and last:
             self._save_model(weights)
-        row["seconds"] = round(meter.seconds + time.perf_counter() - started_s, 3)
+        row["seconds"] = meter.lap_s()
         self._log.history.append(row)
         self._log.seconds += row["seconds"]
         self._log.complete = last
-        self._checkpoints.save(state, dict(vars(self._log)))
+
+    def _keep(self, state: TrainState) -> None:
+        """Writes everything; the checkpoint last, so that what a resumed run need not do again is there."""
         self._folder.write_history(self._log)
-        if last or time.monotonic() - self._reported_s > REPORT_EVERY_S:
+        if self._log.complete or time.monotonic() - self._reported_s > REPORT_EVERY_S:
             self._write_report()
+        self._checkpoints.save(state, dict(vars(self._log)))
 
     def _validate(self, epoch: int, weights: Weights) -> dict[str, Any]:
         assert self._validator is not None
         validation = self._validator.score(weights)
         self._shown = validation.shown
         self._log.last = {"epoch": epoch + 1, **validation.summary}
-        iou = validation.summary["mean_iou"] or 0.0
-        better = not self._log.best or iou > (self._log.best["mean_iou"] or 0.0)
+        iou = validation.summary["mean_iou"]
+        # Where nothing can be scored, the last weights are as good as any.
+        better = not self._log.best or iou is None or iou > self._log.best["mean_iou"]
         if better:
             self._log.best = self._log.last
         if better or self._plan.config.keep == "last":

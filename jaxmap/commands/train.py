@@ -73,7 +73,8 @@ def _summary(metrics: dict) -> str:
     line = f"{metrics['epochs']} epochs: {metrics['examples_seen']} examples, {rate:.1f} a second"
     if metrics["kept_epoch"] is not None:
         kept = metrics["last"] if metrics["kept_epoch"] == metrics["last"]["epoch"] else metrics["best"]
-        line += f"; kept: epoch {metrics['kept_epoch']}, mean IoU {kept['mean_iou']:.3f}"
+        iou = "unknown" if kept["mean_iou"] is None else f"{kept['mean_iou']:.3f}"
+        line += f"; kept: epoch {metrics['kept_epoch']}, mean IoU {iou}"
     return line
 
 

@@ -7,6 +7,7 @@ The metadata key `jaxmap` holds JSON: `format_version`, `architecture` (the fiel
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 from collections.abc import Mapping
 from os import PathLike
@@ -53,6 +54,7 @@ def save_model(
     Raises:
         JaxmapError: no such network can be built, the weights are not its own, or writing failed.
     """
+    from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
     check_architecture(architecture, path)
@@ -67,7 +69,12 @@ def save_model(
         "normalisation": {"mean": list(architecture.mean), "std": list(architecture.std), "scale": "0 to 1, RGB"},
     }
     with atomic_path(path) as temporary:
-        save_file(arrays, temporary, metadata={"jaxmap": json.dumps(record)})
+        try:
+            save_file(arrays, temporary, metadata={"jaxmap": json.dumps(record)})
+        except SafetensorError as error:
+            # The library wraps what the operating system has said.
+            code = errno.ENOSPC if "os error 28" in str(error) else errno.EIO
+            raise OSError(code, str(error)) from error
 
 
 def load_model(path: str | PathLike[str]) -> SavedModel:

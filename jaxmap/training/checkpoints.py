@@ -55,7 +55,8 @@ class Checkpoints:
         step, arguments = int(state.step), self._orbax.args
         try:
             if step in self._open().all_steps():
-                return
+                # A damaged one of the same step, which the run has gone on before.
+                self._open().delete(step)
             self._open().save(
                 step,
                 args=arguments.Composite(state=arguments.StandardSave(_tree(state)), record=arguments.JsonSave(record)),

@@ -57,7 +57,7 @@ class TrainState:
 
 
 class StepInfo(NamedTuple):
-    """What one step did; where `finite` is false, loss or gradient were not, and nothing was changed."""
+    """What one step did; where `finite` is false, loss, gradient or new weights were not, and nothing was changed."""
 
     loss: Float[Array, ""]
     accuracy: Float[Array, ""]
@@ -142,6 +142,8 @@ def make_trainer(
             average = {name: held * mean + (1 - held) * weights[name] for name, mean in state.average.items()}
             norm = optax.global_norm(gradient)
             finite = jnp.isfinite(value) & jnp.isfinite(norm)
+            for weight in weights.values():
+                finite &= jnp.isfinite(weight).all()
             new = TrainState(weights, average, optimiser_state, state.step + 1)
             new = jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state)
         known = labels != IGNORE

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
 from jaxmap.labels import IGNORE
 from jaxmap.models.architecture import Architecture
@@ -61,7 +62,7 @@ class Validator:
         """Scores weights, running statistics included.
 
         Raises:
-            JaxmapError: an image cannot be read any more.
+            JaxmapError: an image cannot be read any more, or the network's answer to it is not finite.
         """
         folded = self._fold(weights)
         if self._run is None:
@@ -72,6 +73,12 @@ class Validator:
         for place, example in enumerate(self._examples):
             image, truth = read_example(example, self._lookup)
             logits = np.asarray(self._run(folded, image[None])[0])  # type: ignore[operator]
+            if not np.isfinite(logits).all():
+                raise JaxmapError(
+                    "the network's answer to a validation image is not finite",
+                    where=example.image,
+                    fix="take a lower optimiser.learning-rate and start anew",
+                )
             scores.add(truth, logits, example.mask)
             summed, counted = _negative_log_likelihood(logits, truth)
             losses, pixels = losses + summed, pixels + counted
