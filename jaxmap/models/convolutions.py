@@ -7,7 +7,7 @@ shifted slices, and a 1x1 convolution takes twice as long as the same matrix pro
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmap.models import convolution_gradients as gradients
 from jaxmap.models.architecture import Padding
-
-PRECISION = jax.lax.Precision.HIGHEST
-"""Full float32 products on accelerators too, where the default would cut the mantissa to 10 bits."""
+from jaxmap.models.convolution_gradients import PRECISION, Sliding
 
 
 def pad_amounts(size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> tuple[int, int]:
@@ -44,14 +43,18 @@ def convolve(
     depthwise: bool = False,
 ) -> Float[Array, "B h w O"]:
     """Convolution without bias; a depthwise kernel has G = 1 and as many outputs as inputs."""
-    if depthwise:
-        return depthwise_convolve(images, kernel, stride=stride, dilation=dilation, padding=padding)
     size = kernel.shape[0]
+    if depthwise:
+        forward = partial(depthwise_convolve, stride=stride, dilation=dilation, padding=padding)
+        top, left = (pad_amounts(images.shape[axis], size, stride, dilation, padding)[0] for axis in (1, 2))
+        return gradients.depthwise(forward, Sliding(size, stride, dilation, (top, left)), images, kernel)
     if size == 1:
-        return jnp.dot(images[:, ::stride, ::stride], kernel[0, 0], precision=PRECISION)
+        return gradients.pointwise(images[:, ::stride, ::stride], kernel[0, 0])
+    # Other products promote by themselves, as double precision needs.
+    dtype = jnp.result_type(images, kernel)
     return jax.lax.conv_general_dilated(
-        images,
-        kernel,
+        images.astype(dtype),
+        kernel.astype(dtype),
         window_strides=(stride, stride),
         padding=[pad_amounts(images.shape[axis], size, stride, dilation, padding) for axis in (1, 2)],
         rhs_dilation=(dilation, dilation),
@@ -135,6 +138,7 @@ def _resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndar
     return low, np.minimum(low + 1, source - 1), (position - low).astype(np.float32)
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(1, 2, 3))
 def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> Array:
     source = images.shape[axis]
     if source == target:
@@ -146,8 +150,32 @@ def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> 
     return before + (jnp.take(images, high, axis=axis, mode="clip") - before) * shares
 
 
+def _resize_axis_forward(images: Array, target: int, axis: int, align_corners: bool) -> tuple[Array, Array]:
+    # Only the size of the axis is needed on the way back, which an empty array tells.
+    return _resize_axis(images, target, axis, align_corners), jnp.zeros((images.shape[axis], 0))
+
+
+def _resize_axis_backward(target: int, axis: int, align_corners: bool, before: Array, cotangent: Array) -> tuple[Array]:
+    source = len(before)
+    if source == target:
+        return (cotangent,)
+    return (gradients.resized(cotangent, _resize_taps(source, target, align_corners), source, axis),)
+
+
+_resize_axis.defvjp(_resize_axis_forward, _resize_axis_backward)
+
+
 def resize_bilinear(
     images: Float[Array, "B H W C"], height: int, width: int, *, align_corners: bool
 ) -> Float[Array, "B h w C"]:
     """Bilinear resizing without antialiasing, as torch and TensorFlow do it."""
     return _resize_axis(_resize_axis(images, height, 1, align_corners), width, 2, align_corners)
+
+
+def resize_rows(matrix: Float[np.ndarray, "source N"], target: int, *, align_corners: bool) -> np.ndarray:
+    """What `resize_bilinear` does along one axis, on the host: (target, N), as precise as the matrix.
+
+    The identity becomes the matrix that takes the pixels there to those wanted.
+    """
+    low, high, share = _resize_taps(len(matrix), target, align_corners)
+    return matrix[low] + (matrix[high] - matrix[low]) * share[:, None]

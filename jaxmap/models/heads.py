@@ -28,6 +28,12 @@ def _plain(inputs: int, outputs: int, record: Architecture, size: int = 1, dilat
     return ConvBlock(inputs, outputs, size, dilation=dilation, norm=norm, eps=record.head_eps)
 
 
+def _three_by_three(inputs: int, record: Architecture, dilation: int = 1) -> SeparableBlock | ConvBlock:
+    if record.separable_aspp:
+        return _separable(inputs, record, dilation)
+    return _plain(inputs, record.head_channels, record, 3, dilation)
+
+
 class Aspp(nnx.Module):
     """Branches that see the features at several scales, side by side, reduced to one depth."""
 
@@ -35,12 +41,9 @@ class Aspp(nnx.Module):
         channels = record.head_channels
         self.pool = _plain(inputs, channels, record)
         self.point = _plain(inputs, channels, record)
-        self.atrous = nnx.List(
-            _separable(inputs, record, rate) if record.separable_aspp else _plain(inputs, channels, record, 3, rate)
-            for rate in record.atrous_rates
-        )
+        self.atrous = nnx.List(_three_by_three(inputs, record, rate) for rate in record.atrous_rates)
         self.project = _plain((2 + len(record.atrous_rates)) * channels, channels, record)
-        self.refine = _separable(channels, record) if record.aspp_conv else None
+        self.refine = _three_by_three(channels, record) if record.aspp_conv else None
         self.pool_first, self.dropout = record.pool_first, record.dropout
 
     def __call__(

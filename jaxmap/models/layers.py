@@ -6,21 +6,13 @@ a file replaces.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Activation, Norm, Padding
+from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
 from jaxmap.models.convolutions import convolve
-
-ACTIVATIONS: dict[Activation, Callable[[Array], Array]] = {
-    "relu": jax.nn.relu,
-    "relu6": jax.nn.relu6,
-    "none": lambda values: values,
-}
 
 BATCH_NORM_MOMENTUM = 0.9
 """Weight of the old running statistics; torch calls the same 0.1."""
@@ -53,9 +45,7 @@ class ConvBlock(nnx.Module):
         self.kernel = nnx.Param(jnp.zeros((size, size, 1 if depthwise else inputs, outputs)))
         self.bias = nnx.Param(jnp.zeros(outputs)) if norm == "bias" else None
         self.norm = (
-            nnx.BatchNorm(
-                outputs, use_running_average=True, momentum=BATCH_NORM_MOMENTUM, epsilon=eps, rngs=nnx.Rngs(0)
-            )
+            BatchNorm(outputs, use_running_average=True, momentum=BATCH_NORM_MOMENTUM, epsilon=eps, rngs=nnx.Rngs(0))
             if norm == "batch"
             else None
         )
@@ -71,10 +61,10 @@ class ConvBlock(nnx.Module):
             depthwise=self.depthwise,
         )
         if self.bias is not None:
-            images = images + self.bias[...]
+            return add_bias(images, self.bias[...], self.activation)
         if self.norm is not None:
-            images = self.norm(images)
-        return ACTIVATIONS[self.activation](images)
+            return self.norm(images, self.activation)
+        return activate(images, self.activation)
 
 
 class SeparableBlock(nnx.Module):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from numpy.typing import ArrayLike
 
 from jaxmap.labels import ROVER_CLASSES
 
@@ -47,7 +48,7 @@ class Mesh(NamedTuple):
     part: Int[np.ndarray, "F"]
 
 
-def make_mesh(vertices_m: np.ndarray, faces: np.ndarray, colours: np.ndarray, surface: Surface, part: int = -1) -> Mesh:
+def make_mesh(vertices_m: np.ndarray, faces: np.ndarray, colours: ArrayLike, surface: Surface, part: int = -1) -> Mesh:
     """A mesh of one surface; `colours` may be one colour for all."""
     return Mesh(
         np.asarray(vertices_m, np.float32),

@@ -86,10 +86,10 @@ def seamless_noise(
     return ((field - field.mean()) / field.std()).astype(np.float32)
 
 
-def smoothstep(value: np.ndarray, lower: float, upper: float) -> np.ndarray:
+def smoothstep(value: np.ndarray | float, lower: float, upper: float) -> np.ndarray:
     """From 0 at `lower` to 1 at `upper`, flat at both ends; falling where `upper` is the smaller."""
-    t = np.clip((value - lower) / (upper - lower), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
+    t = np.clip((np.asarray(value) - lower) / (upper - lower), 0.0, 1.0)
+    return np.asarray(t * t * (3.0 - 2.0 * t))
 
 
 def _in_chunks(evaluate: Callable[[list[np.ndarray]], np.ndarray], coordinates: Sequence[np.ndarray]) -> np.ndarray:
