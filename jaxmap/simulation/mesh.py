@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from numpy.typing import ArrayLike
 
 from jaxmap.labels import ROVER_CLASSES
+from jaxmap.simulation.recipe import Colour
 
 BACKGROUND, SAND, ROCK = (ROVER_CLASSES.index(name) for name in ("background", "sand", "rock"))
 
@@ -48,7 +48,9 @@ class Mesh(NamedTuple):
     part: Int[np.ndarray, "F"]
 
 
-def make_mesh(vertices_m: np.ndarray, faces: np.ndarray, colours: ArrayLike, surface: Surface, part: int = -1) -> Mesh:
+def make_mesh(
+    vertices_m: np.ndarray, faces: np.ndarray, colours: np.ndarray | Colour, surface: Surface, part: int = -1
+) -> Mesh:
     """A mesh of one surface; `colours` may be one colour for all."""
     return Mesh(
         np.asarray(vertices_m, np.float32),

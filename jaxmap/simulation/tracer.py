@@ -20,7 +20,6 @@ LEAST_LLVM = 15
 """Older ones abort the process on processors they do not know."""
 
 _PLACES = ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*")
-_MAC_PLACES = ("/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib", "/usr/local/opt/llvm*/lib/libLLVM*.dylib")
 
 ADVICE = (
     "install LLVM's library, 19 for choice (Debian, Ubuntu: apt install libllvm19), or name it in DRJIT_LIBLLVM_PATH"
@@ -81,7 +80,7 @@ def find_llvm() -> str | None:
     if named:
         return named
     found = {}
-    for pattern in (*_PLACES, *_MAC_PLACES):
+    for pattern in _PLACES:
         for path in sorted(Path("/").glob(pattern[1:])):
             if (version := llvm_version(path.resolve())) is not None and version >= LEAST_LLVM:
                 found.setdefault(version, str(path))

@@ -94,4 +94,4 @@ def _is_in_view(stone: Rock, camera_m: np.ndarray, heading_rad: float, half_angl
     east, north = stone.x_m - camera_m[0], stone.y_m - camera_m[1]
     off = (np.arctan2(north, east) - heading_rad + np.pi) % (2 * np.pi) - np.pi
     # What lies close by casts its shadow into the view from the side, too.
-    return abs(off) < half_angle_rad or np.hypot(east, north) < 2.5
+    return bool(abs(off) < half_angle_rad or np.hypot(east, north) < 2.5)
