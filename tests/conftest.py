@@ -26,6 +26,7 @@ CHECKED_MODULES = (
     "labels",
     "localisation",
     "mapper",
+    "simulation",
     "stereo",
 )
 # A float annotation takes an int, as PEP 484 has it.
