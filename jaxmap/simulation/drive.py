@@ -107,9 +107,9 @@ def _attitude(path: Path, ground_m: Height) -> tuple[np.ndarray, ...]:
         for side in (-1, 1):
             wheel = path.points_m + ahead * WHEEL_BASE_M / 2 * forward + side * WHEEL_TRACK_M / 2 * right
             heights[ahead, side] = ground_m(wheel[:, 0], wheel[:, 1]).astype(np.float64)
-    z = sum(heights.values()) / 6
+    z = np.mean(list(heights.values()), axis=0)
     rise = (heights[1, 1] + heights[1, -1] - heights[-1, 1] - heights[-1, -1]) / 2
-    drop = sum(heights[ahead, -1] - heights[ahead, 1] for ahead in (-1, 0, 1)) / 3
+    drop = np.mean([heights[ahead, -1] - heights[ahead, 1] for ahead in (-1, 0, 1)], axis=0)
     pitch, roll = np.arctan2(rise, WHEEL_BASE_M), np.arctan2(drop, WHEEL_TRACK_M)
     return path.points_m[:, 0], path.points_m[:, 1], z, pitch, roll
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
@@ -74,7 +74,7 @@ def write_raster(
     from rasterio.io import MemoryFile
 
     west, north = raster.west_m + site_utm_m[0], raster.north_m + site_utm_m[1]
-    profile = dict(
+    profile: dict[str, Any] = dict(
         driver="GTiff",
         count=len(bands),
         height=raster.shape[0],

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxmap.simulation.draw import LARGEST_PEBBLE_M, Draw, as_colour
 from jaxmap.simulation.recipe import Colour, RockFieldRecipe, SandRecipe, StoneRecipe
@@ -100,7 +100,7 @@ def draw_rocks(
     features = feature_places_m[: recipe.feature_rocks]
     sizes = draw.rng.uniform(*recipe.feature_size_m, len(features))
     places, diameters = np.concatenate([features, places]), np.concatenate([sizes, diameters])
-    on_path = cKDTree(path_m).query(places)[0]
+    on_path = KDTree(path_m).query(places)[0]
     kept = on_path > PATH_CLEARANCE_M + 0.75 * diameters
     kept &= on_path < reach_m
     kept[kept] = _apart(places[kept], diameters[kept])
@@ -124,7 +124,7 @@ def draw_pebbles(
     lower, upper = path_m.min(axis=0) - reach_m, path_m.max(axis=0) + reach_m
     count = min(draw.rng.poisson(recipe.pebbles_per_m2 * float(np.prod(upper - lower))), 20 * most)
     places = draw.rng.uniform(lower, upper, (count, 2))
-    distance = cKDTree(path_m).query(places)[0]
+    distance = KDTree(path_m).query(places)[0]
     keep = draw.rng.random(count) < 1.0 - distance / reach_m
     places = places[keep][:most]
     # As rocks do, they grow many as they grow small: their number falls with the square of the diameter.
@@ -148,7 +148,7 @@ def _apart(places: np.ndarray, diameters: np.ndarray) -> np.ndarray:
     keep = np.ones(len(places), bool)
     if len(places) < 2:
         return keep
-    for first, second in sorted(cKDTree(places).query_pairs(1.2 * float(diameters.max()))):
+    for first, second in sorted(KDTree(places).query_pairs(1.2 * float(diameters.max()))):
         gap = np.linalg.norm(places[first] - places[second])
         if keep[first] and gap < 0.55 * (diameters[first] + diameters[second]):
             keep[second] = False

@@ -49,7 +49,8 @@ class Shading:
     ) -> None:
         self._mi = mi = load_mitsuba()
         self._dr = load_drjit()
-        self._scene, self.rover = scene, None
+        self._scene = scene
+        self.rover: tuple[Any, np.ndarray] | None = None
         self._faces = [Table(world.faces[:, corner], np.uint32) for corner in range(3)]
         self._surface = Table(world.surface, np.uint32)
         self._vertices = [Table(world.vertices_m[:, axis]) for axis in range(3)]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxmap.simulation.backdrop import backdrop_meshes, clutter_meshes
 from jaxmap.simulation.drive import Path
@@ -73,7 +73,7 @@ def build_world(
     colour = ground.colour(points.x, points.y, height) * (1 - 0.22 * disturbed)[:, None]
     meshes = [ground_mesh(points.x, points.y, height + added, colour, points.faces)]
 
-    tree = cKDTree(line)
+    tree = KDTree(line)
     bare = bare_ground(ground)
     for stones, surface in ((rocks, Surface.ROCK), (pebbles, Surface.PEBBLE)):
         if stones:

@@ -9,7 +9,7 @@ import pytest
 import reference_simulation as reference
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxmap.simulation.draw import LARGEST_PEBBLE_M, SMALLEST_ROCK_M, draw_world
 from jaxmap.simulation.drive import make_path
@@ -176,7 +176,7 @@ def test_rocks_lie_within_bounds_apart_and_off_the_path(kind):
     assert rocks == draw_rocks(recipe.rocks, recipe.stone, recipe.sand, PATH_M, 15.0, places)
     where = np.array([(rock.x_m, rock.y_m) for rock in rocks])
     size = np.array([rock.diameter_m for rock in rocks])
-    on_path = cKDTree(PATH_M).query(where)[0]
+    on_path = KDTree(PATH_M).query(where)[0]
     assert on_path.max() < 15.0 and (on_path > PATH_CLEARANCE_M + 0.5 * size).all()
     assert size.min() >= SMALLEST_ROCK_M
     gaps = np.linalg.norm(where[:, None] - where[None], axis=2) + np.eye(len(where)) * 99
