@@ -11,10 +11,7 @@ import pytest
 
 from jaxmap import host_memory
 
-ASKED = (
-    "glibc.malloc.hugetlb=1:glibc.malloc.mmap_max=0:"
-    f"glibc.malloc.trim_threshold={1 << 62}:glibc.malloc.arena_max=1"
-)
+ASKED = f"glibc.malloc.hugetlb=1:glibc.malloc.mmap_max=0:glibc.malloc.trim_threshold={1 << 62}:glibc.malloc.arena_max=1"
 SCRIPT = """
 import os, sys
 from jaxmap import host_memory
