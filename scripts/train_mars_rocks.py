@@ -3,7 +3,7 @@
     python scripts/train_mars_rocks.py DATA BACKBONE --out DIR
 
 DATA is a folder of images and masks with train.txt and val.txt (MarsData's rocks), BACKBONE a checkpoint that
-`jaxmap weights import` reads. Both runs see the same crops in the same order, half an hour each on two cores;
+`jaxmap weights import` reads. Both runs see the same crops in the same order, some twenty minutes each on two cores;
 interrupted ones go on where they stopped.
 """
 
