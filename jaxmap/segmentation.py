@@ -16,8 +16,9 @@ from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.files import atomic_path
 from jaxmap.models.checkpoint import SavedModel
+from jaxmap.models.compilation import inference_options
 from jaxmap.models.convolutions import resize_bilinear
-from jaxmap.models.deeplab import Images, Weights, fold_batch_norm, pure_network
+from jaxmap.models.deeplab import Images, Weights, inference_network
 from jaxmap.report.pictures import overlay_labels
 
 
@@ -32,9 +33,8 @@ class Segmenter:
     def __init__(self, model: SavedModel, size: tuple[int, int] | None = None) -> None:
         if size is not None and min(size) < 1:
             raise JaxmapError(f"size {size[0]} {size[1]}", where="--size", fix="give a height and a width above 0")
-        architecture, weights = fold_batch_norm(model.architecture, model.weights)
-        network = pure_network(architecture, weights)
-        self.classes, self._weights = architecture.classes, network.weights
+        network = inference_network(model.architecture, model.weights)
+        self.classes, self._weights = network.architecture.classes, network.weights
 
         def run(weights: Weights, images: Images) -> jax.Array:
             if size is None:
@@ -43,7 +43,7 @@ class Segmenter:
             logits = network.apply(weights, inside)
             return resize_bilinear(logits, *images.shape[1:3], align_corners=False)
 
-        self._run = jax.jit(run)
+        self._run = jax.jit(run, compiler_options=inference_options())
 
     def logits(self, image: UInt8[np.ndarray, "H W *rgb"]) -> Float[np.ndarray, "H W C"]:
         """Class logits of a grey or RGB image, at its own size."""

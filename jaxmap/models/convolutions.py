@@ -6,8 +6,9 @@ shifted slices, and a 1x1 convolution takes twice as long as the same matrix pro
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cache
+import itertools
+from collections.abc import Callable
+from functools import cache, reduce
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,9 @@ from jaxmap.models.architecture import Padding
 
 PRECISION = jax.lax.Precision.HIGHEST
 """Full float32 products on accelerators too, where the default would cut the mantissa to 10 bits."""
+
+FEW_CHANNELS = 4
+"""An image's channels, as opposed to features: the library takes twice as long with so few as with twice as many."""
 
 
 def pad_amounts(size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> tuple[int, int]:
@@ -42,11 +46,26 @@ def convolve(
     dilation: int = 1,
     padding: Padding = "torch",
     depthwise: bool = False,
+    row_padding: tuple[int, int] | None = None,
 ) -> Float[Array, "B h w O"]:
-    """Convolution without bias; a depthwise kernel has G = 1 and as many outputs as inputs."""
+    """Convolution without bias.
+
+    Args:
+        images: what is convolved.
+        kernel: a depthwise one has G = 1 and as many outputs as inputs.
+        stride: input pixels for each output pixel, along both axes.
+        dilation: input pixels from one element of the kernel to the next.
+        padding: how many zeros are put around the images, see `pad_amounts`.
+        depthwise: whether each channel has a kernel of its own.
+        row_padding: zeros above and below, where only a band of an image's rows is given (depthwise only).
+    """
     if depthwise:
-        return depthwise_convolve(images, kernel, stride=stride, dilation=dilation, padding=padding)
+        return depthwise_convolve(
+            images, kernel, stride=stride, dilation=dilation, padding=padding, row_padding=row_padding
+        )
     size = kernel.shape[0]
+    if stride == 2 and size == 3 and images.shape[3] <= FEW_CHANNELS and images.shape[2] % 2 == 0:
+        return _convolve_pairs(images, kernel, padding)
     if size == 1:
         return jnp.dot(images[:, ::stride, ::stride], kernel[0, 0], precision=PRECISION)
     return jax.lax.conv_general_dilated(
@@ -60,6 +79,32 @@ def convolve(
     )
 
 
+def _convolve_pairs(
+    images: Float[Array, "B H W I"], kernel: Float[Array, "K K I O"], padding: Padding
+) -> Float[Array, "B h w O"]:
+    """Convolution at stride 2, two columns of the image taken as one of twice the channels.
+
+    That is the same memory, read another way; the kernel gets a column of zeros where it lacks one.
+    """
+    batch, height, width, channels = images.shape
+    size, outputs = kernel.shape[0], kernel.shape[3]
+    rows = pad_amounts(height, size, 2, 1, padding)
+    before, after = pad_amounts(width, size, 2, 1, padding)
+    odd = before % 2
+    count = (width + before + after - size) // 2 + 1
+    pairs = -(-(size + odd) // 2)
+    kernel = jnp.pad(kernel, ((0, 0), (odd, 2 * pairs - size - odd), (0, 0), (0, 0)))
+    first = (before + odd) // 2
+    return jax.lax.conv_general_dilated(
+        images.reshape(batch, height, width // 2, 2 * channels),
+        kernel.reshape(size, pairs, 2 * channels, outputs),
+        window_strides=(2, 1),
+        padding=[rows, (first, count + pairs - 1 - first - width // 2)],
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=PRECISION,
+    )
+
+
 def depthwise_convolve(
     images: Float[Array, "B H W C"],
     kernel: Float[Array, "K K 1 C"],
@@ -67,64 +112,98 @@ def depthwise_convolve(
     stride: int = 1,
     dilation: int = 1,
     padding: Padding = "torch",
+    row_padding: tuple[int, int] | None = None,
 ) -> Float[Array, "B h w C"]:
-    """Each channel with its own kernel, as a sum of shifted slices."""
-    total: Array | float = 0.0
-    for row, column, window in _windows(images, kernel.shape[0], stride, dilation, padding, 0.0):
-        total = total + window * kernel[row, column, 0]
-    return jnp.asarray(total)
+    """Each channel with its own kernel, as a sum of shifted slices; arguments are those of `convolve`."""
+
+    def weighted(windows: list[_Window]) -> Array:
+        terms = [pixels * kernel[row, column, 0] for row, column, pixels in windows]
+        return sum(terms[1:], start=terms[0])
+
+    size = kernel.shape[0]
+    paddings = [pad_amounts(images.shape[axis], size, stride, dilation, padding) for axis in (1, 2)]
+    return _over_windows(weighted, images, size, stride, dilation, (row_padding or paddings[0], paddings[1]))
 
 
 def max_pool(
     images: Float[Array, "B H W C"], *, size: int = 3, stride: int = 2, padding: Padding = "torch"
 ) -> Float[Array, "B h w C"]:
     """The largest value in each window; what is padded never wins."""
-    windows = [window for _, _, window in _windows(images, size, stride, 1, padding, -jnp.inf)]
-    largest = windows[0]
-    for window in windows[1:]:
-        largest = jnp.maximum(largest, window)
-    return largest
+
+    def largest(windows: list[_Window]) -> Array:
+        return reduce(jnp.maximum, [pixels for _, _, pixels in windows])
+
+    rows, columns = (pad_amounts(images.shape[axis], size, stride, 1, padding) for axis in (1, 2))
+    return _over_windows(largest, images, size, stride, 1, (rows, columns))
 
 
-def _windows(
-    images: Array, size: int, stride: int, dilation: int, padding: Padding, fill: float
-) -> Iterator[tuple[int, int, Array]]:
-    """Row and column of each element of a kernel, and the pixels that it meets.
+class _Window(NamedTuple):
+    """Row and column of an element of a kernel, and the pixels that it meets."""
 
-    Elements that meet nothing but padding are left out, and nothing is padded for them: at a dilation
-    as large as the image (36 on 32x32 features) only the middle one is left.
+    row: int
+    column: int
+    pixels: Array
+
+
+def _over_windows(
+    function: Callable[[list[_Window]], Array],
+    images: Array,
+    size: int,
+    stride: int,
+    dilation: int,
+    paddings: tuple[tuple[int, int], tuple[int, int]],
+) -> Array:
+    """The image that `function` makes of a kernel's windows.
+
+    Nothing is padded: where elements of the kernel meet nothing but padding, at the edges, they are left out, and
+    the parts that each have their own elements are put together. That spares a copy of the image, which at a
+    dilation as large as the image would be nine times its size.
     """
-    rows = _Axis.of(images.shape[1], size, stride, dilation, padding)
-    columns = _Axis.of(images.shape[2], size, stride, dilation, padding)
-    padded = jnp.pad(images, ((0, 0), rows.pad, columns.pad, (0, 0)), constant_values=fill)
-    # Without the barrier XLA computes the padding anew for each of the slices.
-    padded = jax.lax.optimization_barrier(padded)
-    for row, vertical in rows.taps:
-        for column, horizontal in columns.taps:
-            yield row, column, padded[:, vertical, horizontal]
+    rows, columns = (
+        _parts(images.shape[axis], size, stride, dilation, amounts) for axis, amounts in enumerate(paddings, start=1)
+    )
+    # XLA would compute what makes the image anew for each of the windows.
+    images = jax.lax.optimization_barrier(images)
+
+    def part(vertical: _Taps, horizontal: _Taps) -> Array:
+        return function(
+            [
+                _Window(row, column, images[:, down, across])
+                for row, down in vertical
+                for column, across in horizontal
+            ]
+        )
+
+    return jnp.concatenate(
+        [jnp.concatenate([part(vertical, horizontal) for horizontal in columns], axis=2) for vertical in rows], axis=1
+    )
 
 
-class _Axis(NamedTuple):
-    """How a kernel slides along one axis: the padding needed, and the slice that each element meets."""
-
-    pad: tuple[int, int]
-    taps: list[tuple[int, slice]]
-
-    @classmethod
-    def of(cls, size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> _Axis:
-        before, after = pad_amounts(size, kernel, stride, dilation, padding)
-        count = (size + before + after - dilation * (kernel - 1) - 1) // stride + 1
-        firsts = {index: index * dilation - before for index in range(kernel)}
-        span = (count - 1) * stride
-        firsts = {index: first for index, first in firsts.items() if first < size and first + span >= 0}
-        start = max(0, -min(firsts.values()))
-        end = max(0, max(firsts.values()) + span - (size - 1))
-        taps = [(index, slice(first + start, first + start + span + 1, stride)) for index, first in firsts.items()]
-        return cls((start, end), taps)
+_Taps = list[tuple[int, slice]]
+"""Elements of a kernel along an axis, and the slice of the image that each meets."""
 
 
 @cache
-def _resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _parts(size: int, kernel: int, stride: int, dilation: int, padding: tuple[int, int]) -> list[_Taps]:
+    """The parts of an axis in which the same elements of a kernel lie inside the image."""
+    before, after = padding
+    count = (size + before + after - dilation * (kernel - 1) - 1) // stride + 1
+    offsets = [index * dilation - before for index in range(kernel)]
+    begins = [min(max(-(offset // stride), 0), count) for offset in offsets]
+    ends = [min(max((size - 1 - offset) // stride + 1, 0), count) for offset in offsets]
+    cuts = sorted({0, count, *begins, *ends})
+    return [
+        [
+            (index, slice(first * stride + offset, (last - 1) * stride + offset + 1, stride))
+            for index, offset in enumerate(offsets)
+            if begins[index] <= first and last <= ends[index]
+        ]
+        for first, last in itertools.pairwise(cuts)
+    ]
+
+
+@cache
+def resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each target pixel along an axis: the source pixels before and after it, and the share of the latter."""
     index = np.arange(target, dtype=np.float64)
     if align_corners:
@@ -139,7 +218,7 @@ def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> 
     source = images.shape[axis]
     if source == target:
         return images
-    low, high, share = _resize_taps(source, target, align_corners)
+    low, high, share = resize_taps(source, target, align_corners)
     shares = share.reshape([-1 if place == axis else 1 for place in range(4)])
     # Two taps a pixel: five times faster than a product with the matrix of weights.
     before = jnp.take(images, low, axis=axis, mode="clip")

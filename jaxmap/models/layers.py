@@ -14,7 +14,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Activation, Norm, Padding
-from jaxmap.models.convolutions import convolve
+from jaxmap.models.convolutions import PRECISION, convolve
+from jaxmap.models.winograd import MIN_CHANNELS, convolve_transformed
 
 ACTIVATIONS: dict[Activation, Callable[[Array], Array]] = {
     "relu": jax.nn.relu,
@@ -47,7 +48,7 @@ class ConvBlock(nnx.Module):
         eps: float = 1e-5,
         activation: Activation = "relu",
     ) -> None:
-        self.stride, self.dilation, self.depthwise = stride, dilation, depthwise
+        self.size, self.stride, self.dilation, self.depthwise = size, stride, dilation, depthwise
         self.padding: Padding = padding
         self.activation: Activation = activation
         self.kernel = nnx.Param(jnp.zeros((size, size, 1 if depthwise else inputs, outputs)))
@@ -60,16 +61,37 @@ class ConvBlock(nnx.Module):
             else None
         )
 
-    def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
-        """Applies the block."""
+    def __call__(
+        self, images: Float[Array, "B H W I"], row_padding: tuple[int, int] | None = None
+    ) -> Float[Array, "B h w O"]:
+        """Applies the block; on a band of an image's rows with the padding that is said."""
+        kernel = self.kernel[...]
+        if kernel.shape[0] != self.size:
+            return self.finish(convolve_transformed(images, kernel, self.dilation))
         images = convolve(
             images,
-            self.kernel[...],
+            kernel,
             stride=self.stride,
             dilation=self.dilation,
             padding=self.padding,
             depthwise=self.depthwise,
+            row_padding=row_padding,
         )
+        return self.finish(images)
+
+    @property
+    def linear(self) -> bool:
+        """Whether nothing follows the convolution."""
+        return self.bias is None and self.norm is None and self.activation == "none"
+
+    @property
+    def transformable(self) -> bool:
+        """Whether `winograd.transformed_kernel` may take the kernel's place, and makes the block faster."""
+        plain = self.size == 3 and self.stride == 1 and not self.depthwise
+        return plain and min(self.kernel.shape[2:]) >= MIN_CHANNELS
+
+    def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
+        """What follows the convolution: bias or norm, then the activation."""
         if self.bias is not None:
             images = images + self.bias[...]
         if self.norm is not None:
@@ -113,7 +135,12 @@ class SeparableBlock(nnx.Module):
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the block."""
-        return self.pointwise(self.depthwise(images))
+        inner, outer = self.depthwise, self.pointwise
+        if inner.linear and inner.dilation >= max(images.shape[1:3]):
+            # Only the middle of the kernel meets the image.
+            kernel = inner.kernel[1, 1, 0][:, None] * outer.kernel[0, 0]
+            return outer.finish(jnp.dot(images, kernel, precision=PRECISION))
+        return outer(inner(images))
 
 
 def dilations(strides: list[int], start: int, output_stride: int, dilate_first: bool) -> list[tuple[int, int]]:
