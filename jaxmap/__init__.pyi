@@ -1,4 +1,6 @@
 from .datasets import ReadOptions, StereoSequence, open_sequence
+from .datasets.images import read_image
+from .deeplab_labeller import make_deeplab_labeller
 from .errors import FrameError, JaxmapError, UsageError
 from .fusion.carve import carve
 from .fusion.integrate import integrate
@@ -11,6 +13,11 @@ from .labellers import Labeller, make_files_labeller, make_no_labeller, make_pla
 from .labels import IGNORE, ROVER_CLASSES
 from .map_store import MapAttributes, load_map, save_map
 from .mapper import Mapper, MapperParams, make_mapper
+from .models.architecture import Architecture, tf_architecture, torch_architecture, torchvision_architecture
+from .models.checkpoint import SavedModel, load_model, load_network, save_model
+from .models.deeplab import PureNetwork, fold_batch_norm, make_network, pure_form, pure_network
+from .models.importers import import_weights
+from .segmentation import Segmenter
 from .sequence import prepare_frames, run_sequence
 from .stereo.front_end import StereoFrontEnd
 from .stereo.options import StereoOptions
@@ -32,6 +39,7 @@ __version__: str
 __all__ = [
     "IGNORE",
     "ROVER_CLASSES",
+    "Architecture",
     "Frame",
     "FrameError",
     "FusionParams",
@@ -44,7 +52,10 @@ __all__ = [
     "MapperParams",
     "Plane",
     "PointLabels",
+    "PureNetwork",
     "ReadOptions",
+    "SavedModel",
+    "Segmenter",
     "StereoCamera",
     "StereoFrontEnd",
     "StereoOptions",
@@ -57,12 +68,18 @@ __all__ = [
     "depth_sigma",
     "disparity_to_points",
     "fit_plane_mlesac",
+    "fold_batch_norm",
+    "import_weights",
     "integrate",
     "load_map",
+    "load_model",
+    "load_network",
+    "make_deeplab_labeller",
     "make_files_labeller",
     "make_fusion_params",
     "make_grid",
     "make_mapper",
+    "make_network",
     "make_no_labeller",
     "make_plane_labeller",
     "make_stereo_camera",
@@ -73,9 +90,16 @@ __all__ = [
     "plane_distance",
     "points_to_pixels",
     "prepare_frames",
+    "pure_form",
+    "pure_network",
+    "read_image",
     "run_sequence",
     "save_map",
+    "save_model",
+    "tf_architecture",
     "top_down",
+    "torch_architecture",
+    "torchvision_architecture",
     "transform_points",
     "voxel_centres",
     "voxel_labels",

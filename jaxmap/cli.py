@@ -10,6 +10,10 @@ from collections.abc import Sequence
 from jaxmap import __version__
 from jaxmap.commands import COMMANDS
 from jaxmap.errors import JaxmapError
+from jaxmap.host_memory import restart_with_large_pages
+
+LARGE_PAGES = ("train",)
+"""Commands that take and give back gigabytes at every step."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,6 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] not in COMMANDS:
         _say(f"error: there is no command {words[0]!r}; choose one of {', '.join(COMMANDS)}")
         return 2
+    if arguments is None and words[0] in LARGE_PAGES:
+        restart_with_large_pages()
     try:
         command = importlib.import_module(f"jaxmap.commands.{words[0]}")
         return command.main(words[1:]) or 0

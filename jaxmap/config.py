@@ -7,10 +7,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import tyro
 from annotated_types import Ge, Gt, Interval, Lt
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict
 
 from jaxmap.errors import UsageError
+from jaxmap.settings import Settings
 from jaxmap.stereo.options import StereoOptions
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -131,6 +133,39 @@ class PlaneConfig:
     """The score of a plane."""
 
 
+def _renaming_from_words(words: list[str]) -> dict[str, str]:
+    pairs = [word.partition("=") for word in words]
+    if not all(name and equals and new_name for name, equals, new_name in pairs):
+        raise ValueError("give pairs such as bus=car")
+    return {name: new_name for name, _, new_name in pairs}
+
+
+_RENAMING_OPTION = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NETWORK=MAP",
+    instance_from_str=_renaming_from_words,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda renaming: [f"{name}={new_name}" for name, new_name in renaming.items()],
+)
+"""A dict of names on the command line; by itself tyro would make an option of each key."""
+
+
+@dataclass(frozen=True)
+class DeeplabConfig:
+    """The network as a labeller."""
+
+    __pydantic_config__ = _STRICT
+
+    class_map: Annotated[dict[str, str], _RENAMING_OPTION] = field(default_factory=dict)
+    """Classes of the network under the names of the map's, where they differ; several may become one."""
+    size_px: tuple[Annotated[int, Gt(0)], Annotated[int, Gt(0)]] | None = None
+    """Height and width that the network runs at; those of the images without it."""
+    soft: bool = True
+    """Fuse the probabilities of all classes, not only the likeliest class."""
+    temperature: Positive = 1.0
+    """Divides the logits: above 1 the probabilities are softer."""
+
+
 @dataclass(frozen=True)
 class MapConfig:
     """Everything that decides what a map comes out as."""
@@ -138,21 +173,31 @@ class MapConfig:
     __pydantic_config__ = _STRICT
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc or folder."""
-    labeller: Literal["plane", "files", "none"] = "plane"
-    """What labels the points: the MLESAC plane, files of labels, or nothing."""
+    """The reader: auto, kitti, euroc, folder or katwijk."""
+    labeller: Literal["plane", "deeplab", "files", "none"] = "plane"
+    """What labels the points: the MLESAC plane, a network, files of labels, or nothing."""
+    model: Path | None = None
+    """Model file of the network, with the deeplab labeller; jaxmap weights import writes them."""
+    model_sha256: str | None = None
+    """SHA-256 that the model file must have; the config.yaml of a run tells it."""
     labels: Path | None = None
     """Folder of labels, with the files labeller: NAME.png class indices or NAME.npy probabilities."""
     labels_are: Literal["auto", "raw", "rectified"] = "auto"
     """On which pixels those labels lie; it must be said where the images are raw and jaxmap rectifies them."""
-    classes: tuple[str, ...] = ("background", "sand", "rock")
-    """The classes, in the order of the label indices."""
+    classes: tuple[str, ...] | None = None
+    """The classes of the map, in the order of the label indices: by default background sand rock; with deeplab
+    the names that deeplab.class_map gives or, without any, all classes of the network. Points of its other
+    classes are mapped without a class. Each class takes as much memory as the occupancy."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: Literal["auto", "z_up", "camera"] = "auto"
     """World of the poses: z up, camera-like (y down), or find out."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
+    camera: str | None = None
+    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    antenna_m: Triple | None = None
+    """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
     max_pose_gap_s: Positive = 1.0
@@ -172,15 +217,10 @@ class MapConfig:
     stereo: StereoOptions = field(default_factory=StereoOptions)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     plane: PlaneConfig = field(default_factory=PlaneConfig)
+    deeplab: DeeplabConfig = field(default_factory=DeeplabConfig)
 
 
-_ADAPTER = TypeAdapter(MapConfig)
-
-
-def config_folder() -> Path:
-    """The folder of configurations that come with jaxmap."""
-    packaged = Path(__file__).parent / "configs"
-    return packaged if packaged.is_dir() else Path(__file__).parents[1] / "configs"
+_SETTINGS = Settings(MapConfig, "map", given=("sequence",))
 
 
 def load_config(name_or_path: str) -> MapConfig:
@@ -189,24 +229,7 @@ def load_config(name_or_path: str) -> MapConfig:
     Raises:
         UsageError: no such file, not YAML, an unknown key, or a value out of range.
     """
-    import yaml
-
-    path = Path(name_or_path)
-    if not path.exists():
-        path = config_folder() / (name_or_path if name_or_path.endswith(".yaml") else f"{name_or_path}.yaml")
-    if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in config_folder().glob("*.yaml")))
-        raise UsageError(f"no config {name_or_path!r}", fix=f"give a YAML file or one of: {known}")
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"not YAML: {error}", where=path, fix="correct the file") from error
-    except OSError as error:
-        raise UsageError(f"cannot be read: {error.strerror}", where=path) from error
-    if not isinstance(tree or {}, dict):
-        raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
-    # The resolved configuration of a run names its sequence; the command line does so here.
-    return check_config({key: value for key, value in (tree or {}).items() if key != "sequence"}, where=path)
+    return _SETTINGS.load(name_or_path)
 
 
 def check_config(tree: dict[str, Any], where: object = "the command line") -> MapConfig:
@@ -215,16 +238,12 @@ def check_config(tree: dict[str, Any], where: object = "the command line") -> Ma
     Raises:
         UsageError: names every unknown key and every value out of range.
     """
-    try:
-        config = _ADAPTER.validate_python(tree)
-    except ValidationError as error:
-        raise UsageError("; ".join(_complaints(error)), where=where, fix="see jaxmap map --help") from error
-    return config
+    return _SETTINGS.check(tree, where)
 
 
 def config_tree(config: MapConfig) -> dict[str, Any]:
     """A configuration as plain values, for YAML and JSON."""
-    return _ADAPTER.dump_python(config, mode="json")
+    return _SETTINGS.tree(config)
 
 
 def split_fusion(fusion: FusionConfig, classes: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -244,17 +263,3 @@ def split_fusion(fusion: FusionConfig, classes: Sequence[str]) -> tuple[dict[str
             fix="name classes of the map, or none",
         )
     return tree, rule
-
-
-def _complaints(error: ValidationError) -> list[str]:
-    """One clause for each fault, by its dotted key."""
-    clauses: dict[str, str] = {}
-    for fault in error.errors():
-        # Branches of a union appear in the location; they are not part of the key.
-        key = ".".join(str(part) for part in fault["loc"] if isinstance(part, int) or part.isidentifier())
-        if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-            clauses[key] = f"unknown key {key}"
-        else:
-            value = repr(fault["input"])
-            clauses.setdefault(key, f"{key} is {value[:60]}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
-    return list(clauses.values())

@@ -1,4 +1,4 @@
-"""Writing files so that a crash or a full disk leaves either the old content or the new, never half of it."""
+"""Where bundled files lie, and writing so that a crash or a full disk leaves either the old content or the new."""
 
 from __future__ import annotations
 
@@ -13,6 +13,12 @@ from jaxmap.errors import JaxmapError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+def config_folder() -> Path:
+    """The folder of configurations that come with jaxmap."""
+    packaged = Path(__file__).parent / "configs"
+    return packaged if packaged.is_dir() else Path(__file__).parents[1] / "configs"
 
 
 @contextmanager

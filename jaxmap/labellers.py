@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.plane import fit_plane_mlesac, plane_distance
@@ -16,6 +16,9 @@ from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, Plane, PointLabels
 
 UP_WORLD = (0.0, 0.0, 1.0)
+
+Needs = Literal["image", "labels", "class_probabilities"]
+"""The fields of `Frame` that a labeller may ask for."""
 
 
 class Labeller(NamedTuple):
@@ -25,19 +28,24 @@ class Labeller(NamedTuple):
         name: as on the command line.
         classes: the classes of its labels, in their order; they become the map's.
         needs: the field of `Frame` that must be filled, or None.
-        label: `(frame, points_world (N, 3), valid (N,), key) -> (PointLabels, Plane | None)`.
+        label: `(frame, points_world (N, 3), valid (N,), params, key) -> (PointLabels, Plane | None)`.
+        params: the numbers that labelling depends on, a pytree whose leaves are differentiable; none
+            for most. They are handed to the step (`MapperParams.labeller`), not compiled into it.
     """
 
     name: str
     classes: tuple[str, ...]
-    needs: Literal["image", "labels", "class_probabilities"] | None
-    label: Callable[[Frame, Float[Array, "N 3"], Bool[Array, "N"], PRNGKeyArray], tuple[PointLabels, Plane | None]]
+    needs: Needs | None
+    label: Callable[
+        [Frame, Float[Array, "N 3"], Bool[Array, "N"], PyTree, PRNGKeyArray], tuple[PointLabels, Plane | None]
+    ]
+    params: PyTree = ()
 
 
 def make_no_labeller() -> Labeller:
     """Geometry alone: no class at all."""
 
-    def label(frame: Frame, points_world: Array, valid: Array, key: Array) -> tuple[PointLabels, None]:
+    def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:
         return PointLabels(keep=valid, labels=jnp.full(valid.shape, IGNORE, jnp.int32)), None
 
     return Labeller("none", (), None, label)
@@ -79,7 +87,7 @@ def make_plane_labeller(
         raise JaxmapError(f"fit_plane_mlesac has no option {', '.join(sorted(unknown))}", where="plane labeller")
     sand, rock = classes.index(on_plane), classes.index(off_plane)
 
-    def label(frame: Frame, points_world: Array, valid: Array, key: Array) -> tuple[PointLabels, Plane]:
+    def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, Plane]:
         plane = fit_plane_mlesac(key, points_world, valid, up_hint=jnp.array(UP_WORLD), **fit)  # type: ignore[arg-type]
         with jax.named_scope("plane_labels"):
             off = jnp.abs(plane_distance(plane, points_world))
@@ -95,7 +103,7 @@ def make_plane_labeller(
 def make_files_labeller(classes: Sequence[str], *, soft: bool) -> Labeller:
     """Labels made elsewhere, carried by the frame: class indices, or probabilities where `soft`."""
 
-    def label(frame: Frame, points_world: Array, valid: Array, key: Array) -> tuple[PointLabels, None]:
+    def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:
         if soft:
             assert frame.class_probabilities is not None
             return PointLabels(keep=valid, probabilities=frame.class_probabilities.reshape(-1, len(classes))), None
@@ -106,7 +114,12 @@ def make_files_labeller(classes: Sequence[str], *, soft: bool) -> Labeller:
 
 
 def harden(labels: PointLabels) -> PointLabels:
-    """Probabilities as labels, the likeliest class each; labels stay what they are."""
+    """Probabilities as labels, the likeliest class each; labels stay what they are.
+
+    What the probabilities lack to 1 is that of no class: where it is the greatest, so is the label.
+    """
     if labels.probabilities is None:
         return labels
-    return PointLabels(keep=labels.keep, labels=labels.probabilities.argmax(axis=-1).astype(jnp.int32))
+    likeliest = labels.probabilities.argmax(axis=-1).astype(jnp.int32)
+    known = labels.probabilities.max(axis=-1) >= 1.0 - labels.probabilities.sum(axis=-1)
+    return PointLabels(keep=labels.keep, labels=jnp.where(known, likeliest, IGNORE))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Int, PRNGKeyArray, PyTree, UInt8
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.carve import carve
@@ -30,6 +30,8 @@ class MapperParams:
 
     camera: StereoCamera
     fusion: FusionParams
+    labeller: PyTree = ()
+    """`Labeller.params`; most labellers have none."""
 
 
 class StepInfo(NamedTuple):
@@ -108,13 +110,19 @@ def make_mapper(
             raise JaxmapError(
                 f"the frame has no {labeller.needs}", where=f"{labeller.name} labeller", fix="fill that field of Frame"
             )
+        if jax.tree.structure(params.labeller) != jax.tree.structure(labeller.params):
+            raise JaxmapError(
+                "the params hold other numbers than the labeller's",
+                where=f"{labeller.name} labeller",
+                fix="build MapperParams with labeller=labeller.params",
+            )
         points_camera, valid = disparity_to_points(params.camera, frame.disparity_px)
         depth_m = points_camera[..., 2]
         in_range = valid & (depth_m >= min_depth_m) & (depth_m <= max_depth_m)
         points_world = transform_points(frame.T_world_camera, points_camera).reshape(-1, 3)
         # Kept apart: labeller and scatter would each compute the points anew, one by one.
         points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
-        labels, plane = labeller.label(frame, points_world, in_range.reshape(-1), key)
+        labels, plane = labeller.label(frame, points_world, in_range.reshape(-1), params.labeller, key)
         return _Observation(depth_m, valid, in_range, points_world, labels, plane)
 
     def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:

@@ -12,8 +12,9 @@ import jaxmap
 from jaxmap.errors import JaxmapError
 from jaxmap.map_store import MapAttributes, save_map
 from jaxmap.mapping_plan import Plan, Tell
+from jaxmap.output_folder import write_json
 from jaxmap.report.html import write_report
-from jaxmap.run_folder import RunFolder, RunLog, peak_resident_mib, write_json
+from jaxmap.run_folder import RunFolder, RunLog, peak_resident_mib
 from jaxmap.run_outputs import count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.types import VoxelMap
@@ -53,7 +54,9 @@ def run_plan(
     elif log.next_index:
         tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
     saved_s = resumed_s = time.perf_counter()
-    frames = prepare_frames(plan.sequence, plan.front_end, plan.label_folder, first=log.next_index)
+    frames = prepare_frames(
+        plan.sequence, plan.front_end, plan.label_folder, needs=plan.labeller.needs, first=log.next_index
+    )
     run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict)
     try:
         for voxel_map, fused in run:
@@ -180,6 +183,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "depth_range_m": list(plan.depth_range_m),
         },
         "labeller": plan.labeller.name,
+        **({"model": {"file": str(plan.model.path), "sha256": plan.model.sha256}} if plan.model is not None else {}),
         "times": {
             "total_s": round(log.total_s, 3),
             "compile_s": round(log.compile_s, 3),

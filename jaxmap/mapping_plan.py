@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,11 +17,15 @@ from jaxmap.config import MapConfig, split_fusion
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
+from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
+from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.models.checkpoint import SavedModel, load_network
+from jaxmap.models.tensor_files import shortened
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import GridSpec, make_grid
@@ -29,6 +33,14 @@ from jaxmap.types import GridSpec, make_grid
 Tell = Callable[[str], None]
 
 _KEY_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """The file of the network that labels, and the SHA-256 of its content."""
+
+    path: Path
+    sha256: str
 
 
 @dataclass(frozen=True)
@@ -40,6 +52,7 @@ class Plan:
     front_end: StereoFrontEnd
     labeller: Labeller
     label_folder: LabelFolder | None
+    model: ModelFile | None
     grid: GridSpec
     depth_range_m: tuple[float, float]
     rule: FusionRule
@@ -52,6 +65,12 @@ class Plan:
     def key_frames(self) -> set[int]:
         """Indices of the frames whose pictures are kept."""
         return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """Settings that were left to the data, as they have come out."""
+        classes = {"classes": list(self.labeller.classes)} if self.labeller.classes else {}
+        return classes | ({"model_sha256": self.model.sha256} if self.model is not None else {})
 
     def digest(self, count: int) -> str:
         """A fingerprint of the first frames, their poses and the camera: what a resumed run must share."""
@@ -78,6 +97,8 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         poses=config.poses,
         poses_world=config.poses_world,
         calibration=config.calibration,
+        camera=config.camera,
+        antenna_m=config.antenna_m,
         start=config.start,
         stop=config.stop,
         stride=config.stride,
@@ -106,12 +127,15 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         )
     depth_range_m = (config.depth.min_m, max_depth_m)
     label_folder = _label_folder(config, sequence)
+    model, network = _model(config)
     with _as_usage_error():
-        labeller = _labeller(config, label_folder)
+        labeller = _labeller(config, label_folder, network)
+        if model is not None and network is not None:
+            tell(_told_network(model, network, labeller.classes))
         grid = _grid(config, sequence, front_end, max_depth_m)
         params, rule = split_fusion(config.fusion, labeller.classes)
         fusion_rule = FusionRule(**rule)
-        mapper_params = MapperParams(camera, make_fusion_params(labeller.classes, **params))
+        mapper_params = MapperParams(camera, make_fusion_params(labeller.classes, **params), labeller.params)
     size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
     tell(
         f"depth {depth_range_m[0]:g} to {max_depth_m:g} m; grid {' x '.join(map(str, grid.shape))} voxels of {size} m, "
@@ -125,6 +149,7 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         front_end=front_end,
         labeller=labeller,
         label_folder=label_folder,
+        model=model,
         grid=grid,
         depth_range_m=depth_range_m,
         rule=fusion_rule,
@@ -163,16 +188,59 @@ def _label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFolder | 
                 fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
             )
         labels_are = "rectified"
-    return open_label_folder(config.labels, len(config.classes), labels_are, sequence.frames[0].name)
+    return open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
 
 
-def _labeller(config: MapConfig, label_folder: LabelFolder | None) -> Labeller:
-    if len(set(config.classes)) < len(config.classes):
-        raise UsageError(f"a class is named twice: {' '.join(config.classes)}", fix="give each class once")
+def _model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
+    """The network that labels, where the labeller is one.
+
+    Raises:
+        JaxmapError: the file cannot be read, or holds no whole network.
+        UsageError: there is no file, or it is not that which the settings tell.
+    """
+    if config.labeller != "deeplab":
+        if config.model is not None:
+            raise UsageError(
+                f"--model is given, but the labeller is {config.labeller}",
+                fix="add --labeller deeplab, or leave it out",
+            )
+        return None, None
+    if config.model is None:
+        raise UsageError(
+            "the deeplab labeller needs a network, and none comes with jaxmap yet",
+            fix="give --model F; jaxmap weights import makes one of a public checkpoint",
+        )
+    saved = load_network(config.model)
+    sha256 = hashlib.sha256(config.model.read_bytes()).hexdigest()
+    if config.model_sha256 is not None and config.model_sha256.lower() != sha256:
+        raise UsageError(
+            f"the model's SHA-256 does not start with {config.model_sha256[:16]}",
+            where=config.model,
+            fix="give the model of that run, or leave out model_sha256",
+        )
+    return ModelFile(config.model, sha256), saved
+
+
+def _told_network(model: ModelFile, network: SavedModel, classes: Sequence[str]) -> str:
+    """One line on the network and its classes."""
+    count = len(network.architecture.classes)
+    return (
+        f"labels by {model.path.name} ({network.architecture.backbone}, {count} classes), "
+        f"mapped as {shortened(classes)}; --classes and --deeplab.class-map choose"
+    )
+
+
+def _labeller(config: MapConfig, label_folder: LabelFolder | None, network: SavedModel | None) -> Labeller:
+    classes = config.classes
+    if classes is not None and len(set(classes)) < len(classes):
+        raise UsageError(f"a class is named twice: {' '.join(classes)}", fix="give each class once")
+    if network is not None:
+        return make_deeplab_labeller(network, classes, **asdict(config.deeplab))
+    classes = ROVER_CLASSES if classes is None else classes
     if label_folder is not None:
-        return make_files_labeller(config.classes, soft=label_folder.soft)
+        return make_files_labeller(classes, soft=label_folder.soft)
     if config.labeller == "plane":
-        return make_plane_labeller(config.classes, **asdict(config.plane))
+        return make_plane_labeller(classes, **asdict(config.plane))
     return make_no_labeller()
 
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
-import json
-import os
 import re
 import resource
 import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +15,9 @@ import numpy as np
 
 from jaxmap.config import MapConfig, config_tree
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.files import atomic_path
 from jaxmap.map_store import holds_map, load_map
 from jaxmap.mapping_plan import Plan
+from jaxmap.output_folder import check_same_settings, locked, write_yaml
 from jaxmap.sequence import FusedFrame
 from jaxmap.types import VoxelMap
 
@@ -102,35 +98,13 @@ class RunFolder:
         self.metrics = path / "metrics.json"
         self.config = path / "config.yaml"
         self.poses = path / "poses.tum"
+        self.scores = path / "scores.json"
+        self.errors = path / "errors.png"
         self.pictures = path / "pictures"
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keeps other runs out of the folder, which is made where it is missing.
-
-        Raises:
-            JaxmapError: another run is writing into it, or it cannot be made.
-        """
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            # The folder itself is locked, so that no lock file is left behind.
-            handle = os.open(self.path, os.O_RDONLY)
-        except OSError as error:
-            reason = "it is a file" if self.path.is_file() else error.strerror
-            raise JaxmapError(f"cannot be made: {reason}", where=self.path, fix="choose another --out") from error
-        try:
-            self._lock(handle)
-            yield
-        finally:
-            os.close(handle)
-
-    def _lock(self, handle: int) -> None:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise JaxmapError(
-                "another run is writing here", where=self.path, fix="wait for it, or choose another --out"
-            ) from error
+    def locked(self) -> AbstractContextManager[None]:
+        """Keeps other runs out of the folder, see `output_folder.locked`."""
+        return locked(self.path)
 
     def begin(self, plan: Plan, config: MapConfig, *, resume: bool, overwrite: bool) -> None:
         """Writes the resolved configuration, or checks that a run can go on.
@@ -139,11 +113,11 @@ class RunFolder:
             JaxmapError: the folder holds a run already, or files of the same names that are no run's.
             UsageError: the run to be resumed had other settings.
         """
-        tree = {"sequence": plan.source, **config_tree(config)}
+        tree = {"sequence": plan.source, **config_tree(config), **plan.resolved}
         # A run that has failed before its first save has left nothing to lose.
         used = holds_map(self.map) or self.metrics.exists()
         if used and resume:
-            self._check_same(tree)
+            check_same_settings(self.config, tree)
             return
         if used and not overwrite:
             raise JaxmapError(
@@ -156,7 +130,10 @@ class RunFolder:
 
     @property
     def _files(self) -> tuple[Path, ...]:
-        return (self.ply, self.geotiff, self.picture, self.metrics, self.poses, self.path / "report.html", self.config)
+        report = self.path / "report.html"
+        # Scores are of the map that is there: they go with it.
+        scored = (self.scores, self.errors)
+        return (self.ply, self.geotiff, self.picture, self.metrics, self.poses, report, self.config, *scored)
 
     def check_apart(self, plan: Plan, config: MapConfig) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
@@ -169,7 +146,7 @@ class RunFolder:
         images |= {frame.right.parent.resolve() for frame in plan.sequence.frames}
         if here == Path(plan.source).resolve() or any(here == folder or folder in here.parents for folder in images):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
-        inputs = {path.resolve() for path in (config.poses, config.calibration) if path is not None}
+        inputs = {path.resolve() for path in (config.poses, config.calibration, config.model) if path is not None}
         for file in self._files:
             if file.resolve() in inputs:
                 raise UsageError("an input would be overwritten", where=file, fix="choose another --out")
@@ -194,25 +171,6 @@ class RunFolder:
         voxel_map, attributes = load_map(self.map)
         return voxel_map, RunLog(**attributes.progress)
 
-    def _check_same(self, tree: dict[str, Any]) -> None:
-        import yaml
-
-        try:
-            before = yaml.safe_load(self.config.read_text(encoding="utf8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise JaxmapError(
-                f"cannot be read: {error}", where=self.config, fix="start anew with --overwrite"
-            ) from error
-        before = before if isinstance(before, dict) else {}
-        before, tree = _dotted(before), _dotted(tree)
-        differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))
-        if differing:
-            raise UsageError(
-                f"the run was begun with another {', '.join(differing)}",
-                where=self.config,
-                fix="resume with the same settings, or start anew with --overwrite",
-            )
-
     def _clear(self) -> None:
         """Removes what an earlier run has written, and nothing else."""
         if not self._is_run():
@@ -230,28 +188,6 @@ class RunFolder:
         for picture in self.pictures.glob("*.png"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 picture.unlink()
-
-
-def _dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A tree of settings as one level, with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat |= _dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
-
-
-def write_yaml(path: Path, tree: dict[str, Any]) -> None:
-    """Writes plain values as YAML, atomically."""
-    import yaml
-
-    with atomic_path(path) as temporary:
-        temporary.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf8")
-
-
-def write_json(path: Path, tree: Any) -> None:
-    """Writes plain values as JSON, atomically."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf8")
 
 
 def peak_resident_mib() -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from jaxmap.datasets.images import IMAGE_SUFFIXES, read_image, read_index_image
+from jaxmap.datasets.images import as_rgb, list_images, read_image, read_index_image
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.files import atomic_path
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.compilation import inference_options
-from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.deeplab import Images, Weights, inference_network
+from jaxmap.models.pixelwise import check_size, resized_input, resized_output
 from jaxmap.report.pictures import overlay_labels
 
 
@@ -28,27 +28,38 @@ class Segmenter:
     Args:
         model: architecture and weights; batch norm is folded.
         size: height and width the network runs at, or None for each image's own.
+
+    Raises:
+        UsageError: a size below 1.
     """
 
     def __init__(self, model: SavedModel, size: tuple[int, int] | None = None) -> None:
-        if size is not None and min(size) < 1:
-            raise JaxmapError(f"size {size[0]} {size[1]}", where="--size", fix="give a height and a width above 0")
+        check_size(size, "--size")
         network = inference_network(model.architecture, model.weights)
         self.classes, self._weights = network.architecture.classes, network.weights
 
         def run(weights: Weights, images: Images) -> jax.Array:
-            if size is None:
-                return network.apply(weights, images)
-            inside = resize_bilinear(images.astype("float32"), *size, align_corners=False)
-            logits = network.apply(weights, inside)
-            return resize_bilinear(logits, *images.shape[1:3], align_corners=False)
+            logits = network.apply(weights, resized_input(images, size))
+            return resized_output(logits, images.shape[1:3])
 
         self._run = jax.jit(run, compiler_options=inference_options())
 
     def logits(self, image: UInt8[np.ndarray, "H W *rgb"]) -> Float[np.ndarray, "H W C"]:
-        """Class logits of a grey or RGB image, at its own size."""
-        rgb = np.broadcast_to(image[..., None], (*image.shape, 3)) if image.ndim == 2 else image
-        return np.asarray(self._run(self._weights, rgb[None])[0])
+        """Class logits of a grey or RGB image, at its own size.
+
+        Raises:
+            JaxmapError: the image is too large for the memory.
+        """
+        try:
+            return np.asarray(self._run(self._weights, as_rgb(image)[None])[0])
+        except (jax.errors.JaxRuntimeError, MemoryError) as fault:
+            if isinstance(fault, MemoryError) or "RESOURCE_EXHAUSTED" in str(fault):
+                raise JaxmapError(
+                    f"an image of {image.shape[1]}x{image.shape[0]} px takes more memory than there is",
+                    where="the network",
+                    fix="run it smaller with --size H W",
+                ) from fault
+            raise
 
 
 class Labelled(NamedTuple):
@@ -60,7 +71,7 @@ class Labelled(NamedTuple):
 
 
 def find_images(sources: Sequence[Path]) -> list[Path]:
-    """Image files, those of folders in order of name.
+    """Image files, those of folders in the natural order of their names.
 
     Raises:
         JaxmapError: a path that is not there, a folder without images, or two images of one name.
@@ -68,10 +79,7 @@ def find_images(sources: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for source in sources:
         if source.is_dir():
-            inside = sorted(path for path in source.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-            if not inside:
-                raise JaxmapError("no images", where=source, fix=f"give a folder of {', '.join(IMAGE_SUFFIXES[:3])}")
-            found += inside
+            found += list_images(source)
         elif source.is_file():
             found.append(source)
         else:
@@ -83,6 +91,46 @@ def find_images(sources: Sequence[Path]) -> list[Path]:
                 f"{other} has the same name, so one output would replace the other", where=path, fix="label them apart"
             )
     return found
+
+
+def check_outputs(images: Sequence[Path], out: Path, *, inputs: Sequence[Path], scores: Path | None) -> None:
+    """Refuses outputs that would replace each other or anything that is read.
+
+    Args:
+        images: what is labelled.
+        out: the folder that is written.
+        inputs: files that are only read: images, masks, model.
+        scores: a file that is written as well.
+
+    Raises:
+        JaxmapError: an output has the place of an input, or two have one name, or what should be a
+            folder is a file.
+    """
+    if out.exists() and not out.is_dir():
+        raise JaxmapError("cannot be made: it is a file", where=out, fix="choose another --out")
+    if scores is not None and scores.is_dir():
+        raise JaxmapError("cannot be written: it is a folder", where=scores, fix="choose another --scores")
+    read = {_identity(path) for path in inputs}
+    names = {f"{image.stem}.png" for image in images}
+    written = [out / name for name in names] + ([] if scores is None else [scores])
+    for image in images:
+        overlay = f"{image.stem}_overlay.png"
+        if overlay in names:
+            raise JaxmapError(
+                f"{overlay} would be both the overlay of {image.name} and the labels of another image",
+                where=out,
+                fix="label them apart",
+            )
+        written.append(out / overlay)
+    for path in sorted(written):
+        if path.exists() and _identity(path) in read:
+            raise JaxmapError(f"{path.name} would be replaced, and it is an input", where=path, fix="write elsewhere")
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """The same for all names of a file."""
+    found = path.stat()
+    return found.st_dev, found.st_ino
 
 
 def find_masks(images: Sequence[Path], folder: Path) -> list[Path]:
@@ -102,15 +150,15 @@ def find_masks(images: Sequence[Path], folder: Path) -> list[Path]:
     return masks
 
 
-def label_images(segmenter: Segmenter, images: Sequence[Path]) -> Iterator[Labelled]:
-    """Labels one image after the other.
+def label_image(segmenter: Segmenter, path: Path) -> Labelled:
+    """Reads an image and labels it.
 
     Raises:
-        JaxmapError: an image cannot be read.
+        FrameError: the image cannot be read.
+        JaxmapError: it is too large for the memory.
     """
-    for path in images:
-        image = read_image(path)
-        yield Labelled(path, image, segmenter.logits(image))
+    image = read_image(path)
+    return Labelled(path, image, segmenter.logits(image))
 
 
 def write_labelled(labelled: Labelled, classes: Sequence[str], out: Path, *, save_logits: bool) -> None:

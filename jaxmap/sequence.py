@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +13,14 @@ import jaxlie
 from jaxtyping import PRNGKeyArray
 
 from jaxmap.datasets.base import FrameRef, StereoSequence
+from jaxmap.datasets.images import as_rgb
 from jaxmap.datasets.label_files import LabelFolder
 from jaxmap.errors import FrameError
+from jaxmap.labellers import Needs
 from jaxmap.mapper import Mapper, MapperParams, StepCost, StepInfo, compile_step
+from jaxmap.prefetch import prefetch
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
 from jaxmap.types import Frame, VoxelMap
-
-In = TypeVar("In")
-Out = TypeVar("Out")
 
 
 @dataclass(frozen=True)
@@ -52,29 +50,12 @@ class FusedFrame:
     cost: StepCost | None = None
 
 
-def prefetch(function: Callable[[In], Out], items: Iterable[In], workers: int, ahead: int) -> Iterator[Out]:
-    """Maps a function over items in threads, in order, at most `ahead` results before they are taken."""
-    source = iter(items)
-    pending: deque[Future[Out]] = deque()
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="jaxmap")
-    try:
-        for item in source:
-            pending.append(pool.submit(function, item))
-            if len(pending) >= ahead:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        # Not waited for: the garbage collector may close this generator in one of the pool's own threads,
-        # which would wait for itself for ever.
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
 def prepare_frames(
     sequence: StereoSequence,
     front_end: StereoFrontEnd,
     label_folder: LabelFolder | None = None,
     *,
+    needs: Needs | None = None,
     first: int = 0,
     workers: int = 2,
     ahead: int = 4,
@@ -85,6 +66,8 @@ def prepare_frames(
         sequence: the frames and their poses.
         front_end: rectification and matching.
         label_folder: where each frame's labels lie, for the `files` labeller.
+        needs: what the labeller asks of each frame (`Labeller.needs`); the rectified left image is delivered,
+            as RGB, where it is `image`.
         first: index of the first frame.
         workers: threads.
         ahead: frames in the making or waiting, which bounds the memory.
@@ -102,13 +85,16 @@ def prepare_frames(
             stages_s = {"read": time.perf_counter() - started_s}
             rectified = front_end(pair.left, pair.right)
             stages_s |= {"rectify": rectified.rectify_s, "match": rectified.match_s}
-            labels: dict[str, Any] = {}
+            labelling: dict[str, Any] = {}
+            if needs == "image":
+                # All as RGB: a grey image between coloured ones must not change the form of a frame.
+                labelling["image"] = jnp.asarray(as_rgb(rectified.left))
             if label_folder is not None:
                 started_s = time.perf_counter()
-                labels = label_folder.read(ref, front_end)
+                labelling |= label_folder.read(ref, front_end)
                 stages_s["labels"] = time.perf_counter() - started_s
             pose = jaxlie.SE3.from_matrix(jnp.asarray(T_world_camera[index], jnp.float32))
-            frame = Frame(jnp.asarray(rectified.disparity_px), pose, **labels)
+            frame = Frame(jnp.asarray(rectified.disparity_px), pose, **labelling)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)

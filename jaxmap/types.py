@@ -86,13 +86,14 @@ def make_stereo_camera(
 class Frame:
     """One stereo frame, ready for the compiled step.
 
-    `disparity_px` is NaN where the matcher found nothing. The last three are present only where
-    the labeller asks for them, so that every frame of a sequence has the same structure.
+    `disparity_px` is NaN where the matcher found nothing; `image` is the rectified left one, grey or RGB. The
+    last three are present only where the labeller asks for them, so that every frame of a sequence has the
+    same structure.
     """
 
     disparity_px: Float[Array, "H W"]
     T_world_camera: jaxlie.SE3
-    image: UInt8[Array, "H W 3"] | None = None
+    image: UInt8[Array, "H W *rgb"] | None = None
     labels: UInt8[Array, "H W"] | None = None
     class_probabilities: Float[Array, "H W C"] | None = None
 

@@ -30,11 +30,16 @@ from PIL import Image
 from jaxmap.datasets import open_sequence
 from jaxmap.datasets.pose_files import write_tum
 from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD
+from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.labellers import Labeller, make_no_labeller, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
-from jaxmap.mapper import Mapper, MapperParams, compile_step, make_mapper
-from jaxmap.run_folder import peak_resident_mib, write_json
+from jaxmap.mapper import Mapper, MapperParams, StepCost, compile_step, make_mapper
+from jaxmap.models.architecture import torch_architecture
+from jaxmap.models.checkpoint import SavedModel
+from jaxmap.models.deeplab import fold_batch_norm, initial_weights, pure_network
+from jaxmap.output_folder import write_json
+from jaxmap.run_folder import peak_resident_mib
 from jaxmap.sequence import prepare_frames, run_sequence
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions
@@ -98,7 +103,7 @@ class Scene:
 
     def params(self, labeller: Labeller) -> MapperParams:
         """The default parameters."""
-        return MapperParams(self.camera, make_fusion_params(labeller.classes))
+        return MapperParams(self.camera, make_fusion_params(labeller.classes), labeller.params)
 
     @contextmanager
     def folder(self) -> Iterator[Path]:
@@ -119,13 +124,11 @@ class Scene:
             yield folder
 
 
-def step_case(scene: Scene, name: str, labeller: Labeller, limit: float) -> Case:
-    """The compiled step against SGBM 3WAY with 128 disparities on the same frame."""
-    options = StereoOptions(num_disparities=DISPARITIES, pad_left=False)
-    front_end = StereoFrontEnd(scene.camera, options)
-    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
+def compiled_step(scene: Scene, front_end: StereoFrontEnd, labeller: Labeller) -> tuple[Callable[[], None], StepCost]:
+    """The compiled step on the scene's frame, into a map that it goes on filling, and what compiling it took."""
     disparity_px = jnp.asarray(front_end(scene.left, scene.right).disparity_px)
-    frame = Frame(disparity_px, jaxlie.SE3.from_matrix(jnp.asarray(scene.pose, jnp.float32)))
+    image = jnp.asarray(scene.left) if labeller.needs == "image" else None
+    frame = Frame(disparity_px, jaxlie.SE3.from_matrix(jnp.asarray(scene.pose, jnp.float32)), image=image)
     mapper, params, key = scene.mapper(labeller), scene.params(labeller), jax.random.key(0)
     state = [mapper.init()]
     mapper, cost = compile_step(mapper, state[0], frame, params, key)
@@ -134,15 +137,42 @@ def step_case(scene: Scene, name: str, labeller: Labeller, limit: float) -> Case
         state[0], _ = mapper.step(state[0], frame, params, key)
         jax.block_until_ready(state[0].log_odds)
 
+    return step, cost
+
+
+def step_case(scene: Scene, name: str, labeller: Labeller, limit: float) -> Case:
+    """The compiled step against SGBM 3WAY with 128 disparities on the same frame."""
+    front_end = StereoFrontEnd(scene.camera, StereoOptions(num_disparities=DISPARITIES, pad_left=False))
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
+    step, cost = compiled_step(scene, front_end, labeller)
+    peer = f"SGBM 3WAY, {DISPARITIES} disparities"
+    temporary_mib = cost.temporary_bytes / 2**20
+    return Case(name, peer, step, lambda: front_end.matcher(*grey), limit, 25, cost.compile_s, temporary_mib)
+
+
+def network_case(scene: Scene, limit: float) -> Case:
+    """The compiled step with a network in it against that network alone, up to probabilities of all pixels."""
+    architecture = torch_architecture("mobilenet_v2", ROVER_CLASSES)
+    saved = SavedModel(architecture, initial_weights(architecture, jax.random.key(0)), "network")
+    front_end = StereoFrontEnd(scene.camera, StereoOptions(num_disparities=DISPARITIES, pad_left=False))
+    step, cost = compiled_step(scene, front_end, make_deeplab_labeller(saved))
+    network = pure_network(*fold_batch_norm(architecture, saved.weights))
+    probabilities = jax.jit(lambda weights, images: jax.nn.softmax(network.apply(weights, images), axis=-1))
+    images = jnp.asarray(scene.left)[None]
+
+    def peer() -> None:
+        probabilities(network.weights, images).block_until_ready()
+
+    temporary_mib = cost.temporary_bytes / 2**20
     return Case(
-        name,
-        f"SGBM 3WAY, {DISPARITIES} disparities",
+        "step: label by MobileNetV2, carve, fuse",
+        "that network alone",
         step,
-        lambda: front_end.matcher(*grey),
+        peer,
         limit,
-        repeats=25,
-        compile_s=cost.compile_s,
-        temporary_mib=cost.temporary_bytes / 2**20,
+        9,
+        cost.compile_s,
+        temporary_mib,
     )
 
 
@@ -209,6 +239,7 @@ def main() -> int:
         cases = [
             step_case(scene, "step: project, MLESAC, carve, fuse", make_plane_labeller(ROVER_CLASSES), 0.25),
             step_case(scene, "step: project, carve, fuse", make_no_labeller(), 0.25),
+            network_case(scene, 1.5),
             sequence_case(scene, folder, 1 / 0.85),
         ]
         for case in cases:

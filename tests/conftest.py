@@ -13,13 +13,14 @@ from jaxtyping import install_import_hook
 # placeholders for leaves, and shapes without arrays.
 FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model")
 NETWORK_MODULES = tuple(
-    f"models.{name}" for name in ("convolutions", "heads", "layers", "mobilenet_v2", "resnet", "xception")
+    f"models.{name}" for name in ("convolutions", "heads", "layers", "mobilenet_v2", "pixelwise", "resnet", "xception")
 )
 CHECKED_MODULES = (
     *FUSION_MODULES,
     *NETWORK_MODULES,
     "evaluation.segmentation_scores",
     "geometry",
+    "deeplab_labeller",
     "labellers",
     "labels",
     "mapper",

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from networks import write_small_model
 from PIL import Image
+from safetensors.numpy import save_file
 from scenes import CAMERA
 
 Damage = Callable[[Path, Path], list[str] | None]
@@ -162,6 +164,19 @@ def wild_probabilities(folder: Path) -> None:
         np.save(folder / f"{file.stem}.npy", np.full((120, 160, 3), 0.7, np.float32))
 
 
+def deeplab(*words: str, **model: bool) -> Damage:
+    def damage(scene: Path, folder: Path) -> list[str]:
+        path = write_small_model(folder / "model.safetensors", **model)
+        return ["--labeller", "deeplab", "--model", str(path), *words]
+
+    return damage
+
+
+def no_model(scene: Path, folder: Path) -> list[str]:
+    save_file({"weight": np.zeros(3, np.float32)}, folder / "model.safetensors")
+    return ["--labeller", "deeplab", "--model", str(folder / "model.safetensors")]
+
+
 MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "missing right image": (1, missing_right),
     "missing left image": (1, missing_left),
@@ -216,4 +231,17 @@ MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "class out of range": (1, labels(strange_label)),
     "label in colours": (1, labels(colour_label)),
     "probabilities over 1": (1, labels(wild_probabilities)),
+    "deeplab without a model": (2, with_words("--labeller", "deeplab")),
+    "a model without deeplab": (2, with_words("--model", "model.safetensors")),
+    "no such model": (1, with_words("--labeller", "deeplab", "--model", "nowhere.safetensors")),
+    "a model that is none": (1, no_model),
+    "a backbone to label the map": (1, deeplab(backbone_only=True)),
+    "another model than was told": (2, deeplab("--model-sha256", "0" * 64)),
+    "classes that the network has not": (2, deeplab("--classes", "sand", "mud", "clay")),
+    "a class map of unknown names": (
+        2,
+        deeplab("--classes", "sand", "rock", "--deeplab.class-map", "stone=rock", "pebble=rock", "gravel=stones"),
+    ),
+    "a network of no size": (2, deeplab("--deeplab.size-px", "0", "64")),
+    "no temperature": (2, deeplab("--deeplab.temperature", "0")),
 }

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from faults import MAP_FAULTS, nan_pose, truncated
 from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
+from network_faults import IMPORT_FAULTS, SEGMENT_FAULTS, segment_words, write_inputs
 
 import jaxmap
 
@@ -49,8 +50,9 @@ def kept() -> dict[str, str]:
 
 def compare(name: str, line: str, tmp_path: Path, told: dict[str, str]) -> None:
     line = line.replace(str(tmp_path), "<tmp>")
-    # The decoder's own words differ from version to version.
-    told[name] = re.sub(r"\((image file is truncated|unrecognized data stream|broken PNG)[^;]*\)", "(<decoder>)", line)
+    # The decoders' own words differ from version to version.
+    words = "image file is truncated|unrecognized data stream|broken PNG|Error while deserializing"
+    told[name] = re.sub(rf"\(({words})[^;]*\)", "(<decoder>)", line)
     if not os.environ.get("JAXMAP_UPDATE_SNAPSHOTS"):
         assert told[name] == kept().get(name, "JAXMAP_UPDATE_SNAPSHOTS=1 writes it")
 
@@ -68,6 +70,37 @@ def test_a_fault_of_map_is_one_line(name, scene_copy, tmp_path, cli, told, monke
     assert NAMED.get(name, "") in outcome.error, "says where"
     assert not (tmp_path / "run" / "metrics.json").exists()
     compare(name, f"{outcome.status} {outcome.error}", tmp_path, told)
+
+
+def files_of(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", SEGMENT_FAULTS)
+def test_a_fault_of_segment_is_one_line(name, tmp_path, cli, told):
+    expected, spoil = SEGMENT_FAULTS[name]
+    more = spoil(write_inputs(tmp_path)) or []
+    before = files_of(tmp_path)
+    outcome = cli(*segment_words(tmp_path, *more))
+    assert outcome.status == expected, outcome
+    assert "fault of jaxmap" not in outcome.error
+    assert ";" in outcome.error, "says what to do"
+    compare(name, f"{outcome.status} {outcome.error}", tmp_path, told)
+    assert files_of(tmp_path) == before, "nothing is written and no input is touched"
+
+
+@pytest.mark.parametrize("name", IMPORT_FAULTS)
+def test_a_fault_of_weights_is_one_line(name, tmp_path, cli, told):
+    expected, make = IMPORT_FAULTS[name]
+    words = make(tmp_path)
+    before = files_of(tmp_path)
+    outcome = cli(*words)
+    assert outcome.status == expected, outcome
+    assert "fault of jaxmap" not in outcome.error
+    assert ";" in outcome.error, "says what to do"
+    assert len(outcome.error) < 600
+    compare(name, f"{outcome.status} {outcome.error}", tmp_path, told)
+    assert files_of(tmp_path) == before, "nothing is written and no input is touched"
 
 
 def faulty_command(name: str, tmp_path: Path, finished: Path) -> tuple[int, list[str]]:
@@ -98,6 +131,11 @@ def faulty_command(name: str, tmp_path: Path, finished: Path) -> tuple[int, list
         "report of no folder": (1, ["report", str(tmp_path / "nowhere")]),
         "report without metrics": (1, ["report", str(no_metrics)]),
         "unknown command": (2, ["mapp"]),
+        "segment without images": (2, ["segment", "--model", "m.safetensors", "--out", "out"]),
+        "scores without masks": (
+            2,
+            ["segment", "a.png", "--model", "m.safetensors", "--out", "out", "--scores", "scores.json"],
+        ),
     }[name]
 
 
@@ -119,6 +157,8 @@ def faulty_command(name: str, tmp_path: Path, finished: Path) -> tuple[int, list
         "report of no folder",
         "report without metrics",
         "unknown command",
+        "segment without images",
+        "scores without masks",
     ],
 )
 def test_a_wrong_command_is_one_line(name, tmp_path, finished_run, cli, told):
@@ -142,8 +182,14 @@ def test_a_wrong_command_is_one_line(name, tmp_path, finished_run, cli, told):
         ("map", "sample:motorcycle", "--out", "run", "--stride", "two"),
         ("map", "sample:motorcycle", "--out", "run", "--labeller", "oracle"),
         ("map", "sample:motorcycle", "--out", "run", "--config"),
+        ("map", "sample:motorcycle", "--out", "run", "--deeplab.class-map", "car"),
         ("export",),
         ("export", "run", "--format", "stl"),
+        ("segment", "a.png"),
+        ("segment", "a.png", "--model", "m.safetensors", "--out", "out", "--size", "64"),
+        ("weights", "import", "a.pth"),
+        ("weights", "import", "a.pth", "--out", "m.safetensors", "--output-stride", "4"),
+        ("weights", "fetch"),
     ],
 )
 def test_what_the_parser_refuses_has_status_2(words, cli, tmp_path, monkeypatch):

@@ -13,17 +13,19 @@ from hypothesis import strategies as st
 
 from jaxmap.config import (
     RULE_FIELDS,
+    DeeplabConfig,
     FusionConfig,
     GridConfig,
     MapConfig,
     PlaneConfig,
     check_config,
-    config_folder,
     config_tree,
     load_config,
     split_fusion,
 )
+from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.errors import UsageError
+from jaxmap.files import config_folder
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.labellers import make_plane_labeller
@@ -48,6 +50,12 @@ def test_every_config_loads_and_is_read_to_the_last_key(path):
 
     check(tree, config_tree(config))
     assert path.read_text().startswith("#"), "says what it is"
+
+
+def test_defaults_of_the_deeplab_section_are_those_of_the_labeller():
+    labeller = inspect.signature(make_deeplab_labeller).parameters
+    for name, value in asdict(DeeplabConfig()).items():
+        assert (labeller[name].default or {}) == (value or {}), name
 
 
 def test_there_is_a_config_for_the_paper():
@@ -113,14 +121,16 @@ def test_the_defaults_of_the_plane_are_those_of_the_functions():
 
 
 def test_every_setting_has_a_default_and_says_what_it_is():
-    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, StereoOptions):
+    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, DeeplabConfig, StereoOptions):
         source = inspect.getsource(kind)
         for field in fields(kind):
             assert field.default is not MISSING or field.default_factory is not MISSING, field.name
-            section = field.name in ("grid", "depth", "stereo", "fusion", "plane")
+            section = field.name in ("grid", "depth", "stereo", "fusion", "plane", "deeplab")
             assert section or f"    {field.name}: " in source
         described = source.count('    """') - 1
-        sections = sum(field.name in ("grid", "depth", "stereo", "fusion", "plane") for field in fields(kind))
+        sections = sum(
+            field.name in ("grid", "depth", "stereo", "fusion", "plane", "deeplab") for field in fields(kind)
+        )
         assert described == len(fields(kind)) - sections, kind.__name__
 
 
@@ -145,6 +155,8 @@ def test_every_setting_has_a_default_and_says_what_it_is():
         ({"seed": 2**31}, ["seed is 2147483648"]),
         ({"labeller": "oracle"}, ["labeller is 'oracle'"]),
         ({"classes": "rock"}, ["classes is 'rock'"]),
+        ({"deeplab": {"size_px": [0, 8], "temperature": 0}}, ["deeplab.size_px.0 is 0", "deeplab.temperature is 0"]),
+        ({"deeplab": {"class_map": {"bus": 3}, "softly": True}}, ["deeplab.class_map.bus", "deeplab.softly"]),
         ({"grid": None}, ["grid is None"]),
     ],
 )

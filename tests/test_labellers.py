@@ -28,7 +28,7 @@ def frame_of(**fields) -> Frame:
 
 @partial(jax.jit, static_argnums=0)
 def label_with(labeller: Labeller, frame, points, valid, key):
-    return labeller.label(frame, points, valid, key)
+    return labeller.label(frame, points, valid, labeller.params, key)
 
 
 def beach(rng: np.random.Generator) -> np.ndarray:

@@ -9,7 +9,7 @@ from PIL import Image
 from jaxmap.fusion.query import TopDown
 from jaxmap.labels import IGNORE, ROVER_CLASSES, class_colours
 from jaxmap.report.pictures import colourise_disparity, colourise_labels, overlay_labels, top_down_picture
-from jaxmap.report.plan import _nice
+from jaxmap.report.plan_sheet import _nice
 from jaxmap.report.relief import UNOBSERVED_COLOUR, relief
 from jaxmap.types import make_grid
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import threading
 from dataclasses import replace
 from functools import partial
@@ -96,7 +97,7 @@ def test_faults_are_one_line_and_nothing_is_written(cli, model, images, tmp_path
     assert "label 3, but there are 3 classes" in cli(*words, "--masks", masks).error
     assert "no such file" in cli("segment", tmp_path / "no.png", "--model", model, "--out", out).error
     assert "same name" in cli("segment", images, images / "a.png", "--model", model, "--out", out).error
-    assert "no such file" in cli("segment", images, "--model", tmp_path / "no.safetensors", "--out", out).error
+    assert "no such model file" in cli("segment", images, "--model", tmp_path / "no.safetensors", "--out", out).error
     outcome = cli(*words, "--scores", tmp_path / "scores.json")
     assert outcome.status == 2 and "--masks" in outcome.error
     assert not out.exists()
@@ -167,8 +168,8 @@ def test_weights_are_fetched_checked_and_kept(cli, server, tmp_path, monkeypatch
 
 def test_the_table_of_public_weights_is_well_formed():
     for public in weight_files.PUBLIC.values():
-        assert public.url.startswith("https://") and len(public.sha256) >= 8
-        assert public.sha256[:8] in public.url
+        assert public.url.startswith("https://") and re.fullmatch("[0-9a-f]{64}", public.sha256)
+        assert public.url.endswith(f"-{public.sha256[:8]}.pth")
 
 
 @pytest.mark.realdata

@@ -14,7 +14,8 @@ from test_mapping_run import planned
 
 from jaxmap.datasets.base import StereoPair
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.sequence import prefetch, prepare_frames, run_sequence
+from jaxmap.prefetch import prefetch
+from jaxmap.sequence import prepare_frames, run_sequence
 
 
 def own_threads() -> list[threading.Thread]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 COMMANDS: dict[str, str] = {
     "demo": "map the bundled sample with every labeller and show what comes out",
     "map": "map a stereo sequence",
+    "train": "train or fine-tune DeepLabv3+ on images and masks",
+    "evaluate": "score a map against an orthomosaic labelled from above",
     "segment": "label images with a network, and score the labels",
     "weights": "convert or download pretrained networks",
     "export": "write a map in another form",

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import tyro
 
@@ -40,6 +40,14 @@ def _value_of(option: str, words: Sequence[str]) -> str | None:
         elif word.startswith(f"{option}="):
             value = word.partition("=")[2]
     return value
+
+
+class Advance(Protocol):
+    """Takes the progress of long work."""
+
+    def __call__(self, done: int, note: str = "") -> None:
+        """So many are done; `note` says how it goes."""
+        ...
 
 
 class Console:
@@ -80,26 +88,26 @@ class Console:
             yield lambda fused: advance(fused.prepared.index + 1)  # type: ignore[attr-defined]
 
     @contextmanager
-    def steps(self, title: str, unit: str, total: int) -> Iterator[Callable[[int], None]]:
-        """Shows progress over `total` of `unit`; yields what is to be called with the number done."""
+    def steps(self, title: str, unit: str, total: int) -> Iterator[Advance]:
+        """Shows progress over `total` of `unit`; yields what is to be called with the number done, and a note."""
         if not self._rich.is_terminal:
             yield self._plain_steps(title, unit, total)
             return
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=self._rich, transient=True) as bar:
-            task = bar.add_task(title, total=total)
-            yield lambda done: bar.update(task, completed=done)
+        with Progress(*columns, TextColumn("{task.fields[note]}"), console=self._rich, transient=True) as bar:
+            task = bar.add_task(title, total=total, note="")
+            yield lambda done, note="": bar.update(task, completed=done, note=note)
 
-    def _plain_steps(self, title: str, unit: str, total: int) -> Callable[[int], None]:
+    def _plain_steps(self, title: str, unit: str, total: int) -> Advance:
         told_s = time.monotonic()
 
-        def advance(done: int) -> None:
+        def advance(done: int, note: str = "") -> None:
             nonlocal told_s
             if time.monotonic() - told_s > 10:
                 told_s = time.monotonic()
-                print(f"{title}: {done} of {total} {unit}", file=sys.stderr)
+                print(f"{title}: {done} of {total} {unit}{note and f', {note}'}", file=sys.stderr)
 
         return advance
 

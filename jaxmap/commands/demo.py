@@ -62,8 +62,9 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.map_store import load_map
     from jaxmap.mapping import run_plan
     from jaxmap.mapping_plan import plan_run
+    from jaxmap.output_folder import write_json
     from jaxmap.report.demo_page import write_demo_page
-    from jaxmap.run_folder import RunFolder, write_json
+    from jaxmap.run_folder import RunFolder
 
     keep_compiled_programs()
     console = Console()

@@ -26,8 +26,8 @@ def main(words: Sequence[str]) -> int:
 
     import jaxmap
     from jaxmap.cache import cache_folder
-    from jaxmap.config import config_folder
     from jaxmap.datasets import READERS
+    from jaxmap.files import config_folder
 
     lines = {
         "jaxmap": jaxmap.__version__,

@@ -5,18 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.errors import UsageError
+from jaxmap.errors import FrameError, JaxmapError, UsageError
+
+if TYPE_CHECKING:
+    from jaxmap.segmentation import Segmenter
 
 
 @dataclass(frozen=True)
 class SegmentArguments:
     """Label images with a network.
 
-    Writes NAME.png (class indices) and NAME_overlay.png for each image, at its own size.
+    Writes NAME.png (class indices) and NAME_overlay.png for each image, at its own size and on its pixels
+    as they are stored: the rotation tag of a photograph is not applied. Inputs are never replaced; an image
+    that cannot be read is passed over, told, and makes the exit status 1.
     """
 
     images: tyro.conf.Positional[tuple[Path, ...]]
@@ -44,42 +50,60 @@ def main(words: Sequence[str]) -> int:
         raise UsageError("there is nothing to score against", where="--scores", fix="give --masks DIR")
 
     from jaxmap.cache import keep_compiled_programs
-    from jaxmap.evaluation.segmentation_scores import SegmentationScores
     from jaxmap.models.checkpoint import load_network
-    from jaxmap.run_folder import write_json
-    from jaxmap.segmentation import (
-        Segmenter,
-        check_masks,
-        find_images,
-        find_masks,
-        label_images,
-        score_image,
-        write_labelled,
-    )
+    from jaxmap.segmentation import Segmenter, check_masks, check_outputs, find_images, find_masks
 
     keep_compiled_programs()
-    console = Console()
     images = find_images(arguments.images)
     model = load_network(arguments.model)
-    masks = None if arguments.masks is None else find_masks(images, arguments.masks)
+    masks = [] if arguments.masks is None else find_masks(images, arguments.masks)
+    inputs = [*images, *masks, arguments.model]
+    check_outputs(images, arguments.out, inputs=inputs, scores=arguments.scores)
     segmenter = Segmenter(model, arguments.size)
-    scores = SegmentationScores.empty(segmenter.classes)
-    if masks is not None:
+    if masks:
         check_masks(images, masks, len(segmenter.classes))
-    with console.steps("labelling", "images", len(images)) as advance:
-        for index, labelled in enumerate(label_images(segmenter, images)):
-            write_labelled(labelled, segmenter.classes, arguments.out, save_logits=arguments.save_logits)
-            if masks is not None:
-                score_image(scores, labelled, masks[index])
-            advance(index + 1)
-    if masks is not None:
-        summary = scores.summary()
-        console.table(_title(summary), COLUMNS, _rows(summary))
-        if arguments.scores is not None:
-            write_json(arguments.scores, summary)
-            console.tell(f"scores: {arguments.scores}")
-    console.result(arguments.out, ["NAME.png", "NAME_overlay.png", *(["NAME_logits.npy"] * arguments.save_logits)])
+    _label(arguments, segmenter, images, masks)
     return 0
+
+
+def _label(arguments: SegmentArguments, segmenter: Segmenter, images: list[Path], masks: list[Path]) -> None:
+    """Labels, writes and scores all images; those that cannot be read are told at the end."""
+    from jaxmap.evaluation.segmentation_scores import SegmentationScores
+    from jaxmap.segmentation import label_image, score_image, write_labelled
+
+    console, faults = Console(), []
+    scores = SegmentationScores.empty(segmenter.classes)
+    with console.steps("labelling", "images", len(images)) as advance:
+        for index, image in enumerate(images):
+            try:
+                labelled = label_image(segmenter, image)
+            except FrameError as fault:
+                faults.append(fault)
+            else:
+                write_labelled(labelled, segmenter.classes, arguments.out, save_logits=arguments.save_logits)
+                if masks:
+                    score_image(scores, labelled, masks[index])
+            advance(index + 1)
+    if masks:
+        _tell_scores(console, scores.summary(), arguments.scores)
+    if len(faults) < len(images):
+        names = ["NAME.png", "NAME_overlay.png", *(["NAME_logits.npy"] * arguments.save_logits)]
+        console.result(arguments.out, names)
+    if faults:
+        raise JaxmapError(
+            f"{len(faults)} of {len(images)} images could not be labelled; the first: {faults[0].what}",
+            where=faults[0].where,
+            fix=faults[0].fix,
+        )
+
+
+def _tell_scores(console: Console, summary: dict, file: Path | None) -> None:
+    from jaxmap.output_folder import write_json
+
+    console.table(_title(summary), COLUMNS, _rows(summary))
+    if file is not None:
+        write_json(file, summary)
+        console.tell(f"scores: {file}")
 
 
 COLUMNS = {"name": "class", "iou": "IoU", "precision": "precision", "recall": "recall", "pixels": "true pixels"}

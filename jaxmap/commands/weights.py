@@ -24,8 +24,9 @@ jaxmap weights import --help and jaxmap weights fetch --help say more."""
 class ImportArguments:
     """Convert a public checkpoint to a model file.
 
-    Known are segmentation_models_pytorch's DeepLabV3Plus, torchvision's and timm's ResNet-18, 50, 101
-    and MobileNetV2, and TensorFlow's folded MobileNetV2 and DeepLabv3. Files are .safetensors, or .pth
+    Known are segmentation_models_pytorch's DeepLabV3Plus, torchvision's DeepLabv3 on ResNet-50 and 101,
+    torchvision's and timm's ResNet-18, 50, 101 and MobileNetV2 for ImageNet, and TensorFlow's folded
+    MobileNetV2 and DeepLabv3. Files are .safetensors, or .pth
     as PyTorch has written it since 1.6; nothing in them is executed.
     """
 
@@ -35,8 +36,8 @@ class ImportArguments:
     """The .safetensors file to write."""
     classes: tuple[str, ...] | None = None
     """Names of its classes, in order."""
-    output_stride: Literal[16, 8] = 16
-    """The stride to run the network at; checkpoints do not tell."""
+    output_stride: Literal[16, 8] | None = None
+    """The stride to run the network at, which checkpoints do not tell: 16, or 8 for torchvision's DeepLabv3."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Readers of stereo sequences: `open_sequence` opens a folder or a bundled sample."""
 
-from jaxmap.datasets import euroc, folder, kitti
+from jaxmap.datasets import euroc, folder, katwijk, kitti
 from jaxmap.datasets.assemble import Reader, ReadOptions
 from jaxmap.datasets.base import FrameRef, StereoPair, StereoSequence
 from jaxmap.datasets.registry import READERS, open_sequence, register
@@ -16,5 +16,5 @@ __all__ = [
     "register",
 ]
 
-for _reader in (kitti.READER, euroc.READER, folder.READER):
+for _reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER):
     register(_reader)

@@ -28,7 +28,9 @@ class ReadOptions:
             alone), instead of the sequence's own.
         poses_world: the world of the poses: `z_up`, `camera` (x right, y down, z forward), or
             `auto` to tell by which way the cameras' up axes point.
-        calibration: a camera YAML, instead of the sequence's own calibration.
+        calibration: a camera YAML, instead of the sequence's own calibration (Katwijk: or MATLAB's .mat).
+        camera: which stereo camera, where a data set has several; by default its first.
+        antenna_m: where the GPS antenna is on the rover, in the data set's IMU frame, where poses come from GPS.
         start, stop, stride: which frames, as a Python slice of the frames on disk.
         max_pose_gap_s: poses further apart are not interpolated.
         crs: the coordinate reference system of the poses, where the data do not say it.
@@ -38,6 +40,8 @@ class ReadOptions:
     poses: Path | None = None
     poses_world: PosesWorld = "auto"
     calibration: Path | None = None
+    camera: str | None = None
+    antenna_m: tuple[float, float, float] | None = None
     start: int = 0
     stop: int | None = None
     stride: int = 1
@@ -54,12 +58,14 @@ class Reader:
         help: one line, which also says what is looked for.
         recognises: whether a folder is of this kind, by its content; it never raises.
         open: opens a folder.
+        cameras: what `ReadOptions.camera` chooses among; empty where there is no choice.
     """
 
     name: str
     help: str
     recognises: Callable[[Path], bool]
     open: Callable[[Path, ReadOptions], StereoSequence]
+    cameras: tuple[str, ...] = ()
 
 
 def read_pose_track(
@@ -101,7 +107,7 @@ def assemble(
     track: PoseTrack,
     camera: StereoCamera | StereoRig,
     options: ReadOptions,
-    T_child_camera: Float64[np.ndarray, "4 4"] | None = None,
+    T_child_camera: Float64[np.ndarray, "*frames 4 4"] | None = None,
     crs: str | None = None,
     notes: Sequence[str] = (),
     read_pair: Callable[[FrameRef], StereoPair] = read_stereo_pair,
@@ -119,7 +125,8 @@ def assemble(
         track: their poses; without times, one for each frame.
         camera: the calibration.
         options: selection, world and gap.
-        T_child_camera: the left camera in the child frame of the poses; None where they are one.
+        T_child_camera: the left camera in the child frame of the poses, for all frames or (N, 4, 4) for
+            each; None where they are one.
         crs: the coordinate reference system of the poses.
         notes: what the reader found.
         read_pair: reads the images of one frame.
@@ -153,7 +160,7 @@ def assemble(
         )
     T_source_camera = T_source_child[has_pose]
     if T_child_camera is not None:
-        T_source_camera = T_source_camera @ T_child_camera
+        T_source_camera = T_source_camera @ (T_child_camera if T_child_camera.ndim == 2 else T_child_camera[has_pose])
     T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ _COLOUR_MODES = ("RGB", "RGBA", "RGBX", "RGBa", "P", "PA", "CMYK", "YCbCr", "HSV
 ImageArray = UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]
 
 
-def read_image(path: Path) -> ImageArray:
+def read_image(path: str | PathLike[str]) -> ImageArray:
     """Reads an image as 8-bit grey or RGB.
 
     Grey stays grey, RGB stays RGB, palettes and other colour spaces become RGB, and alpha is
@@ -39,7 +40,7 @@ def read_image(path: Path) -> ImageArray:
     Raises:
         FrameError: the file is missing, truncated, not an image, or of a pixel type that is neither.
     """
-    pixels = _read_pixels(path)
+    pixels = _read_pixels(Path(path))
     return _to_8_bits(pixels, _significant_bits(pixels))
 
 
@@ -62,6 +63,11 @@ def read_index_image(path: Path) -> UInt8[np.ndarray, "H W"]:
             f"a label image of type {mode}", where=path, fix="write class indices as 8-bit grey or palette"
         )
     return pixels
+
+
+def as_rgb(image: ImageArray) -> UInt8[np.ndarray, "H W 3"]:
+    """A grey or RGB image as RGB."""
+    return np.broadcast_to(image[..., None], (*image.shape, 3)) if image.ndim == 2 else image
 
 
 def read_stereo_pair(frame: FrameRef) -> StereoPair:

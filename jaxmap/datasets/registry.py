@@ -44,7 +44,7 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
         what = f"{source} is a file" if folder.exists() else f"there is no folder {source}"
         raise JaxmapError(what, fix="give the folder of one sequence, or sample:NAME")
     if options.dataset != "auto":
-        return READERS[options.dataset].open(folder, options)
+        return _open_with(READERS[options.dataset], folder, options)
     fitting = [reader for reader in READERS.values() if reader.recognises(folder)]
     if not fitting:
         known = "; ".join(f"{reader.name}: {reader.help}" for reader in READERS.values())
@@ -54,7 +54,14 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
     if len(fitting) > 1:
         names = " and ".join(reader.name for reader in fitting)
         raise JaxmapError(f"{names} both fit", where=source, fix="choose one with --dataset")
-    return fitting[0].open(folder, options)
+    return _open_with(fitting[0], folder, options)
+
+
+def _open_with(reader: Reader, folder: Path, options: ReadOptions) -> StereoSequence:
+    if options.camera is not None and options.camera not in reader.cameras:
+        fix = f"choose {' or '.join(reader.cameras)}" if reader.cameras else "leave the option out"
+        raise UsageError(f"{reader.name} has no camera {options.camera!r}", where="--camera", fix=fix)
+    return reader.open(folder, options)
 
 
 def _check_options(options: ReadOptions) -> None:
@@ -66,6 +73,8 @@ def _check_options(options: ReadOptions) -> None:
         raise UsageError(
             f"poses_world is {options.poses_world!r}", where="options", fix=f"choose {', '.join(get_args(PosesWorld))}"
         )
+    if options.antenna_m is not None and not all(map(math.isfinite, options.antenna_m)):
+        raise UsageError(f"antenna_m is {options.antenna_m}", where="options", fix="give three lengths in metres")
     if options.crs is not None:
         _check_crs(options.crs)
     if options.stride < 1:

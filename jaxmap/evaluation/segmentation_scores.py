@@ -83,6 +83,7 @@ class SegmentationScores:
                 for index, name in enumerate(self.classes)
             },
             "confusion": self.confusion.tolist(),
+            "calibration": self.calibration.tolist(),
             "ece": _quotient(abs(self.calibration[:, 1] - self.calibration[:, 2]).sum(), total),
             "images": self.images,
             "pixels": int(total),

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from jaxmap.errors import JaxmapError
 from jaxmap.files import atomic_path
 from jaxmap.fusion.query import TopDown
+from jaxmap.geometry.grid import exact_corner
 from jaxmap.labels import IGNORE
 from jaxmap.types import GridSpec
 
@@ -67,8 +68,8 @@ def _encode(
     from rasterio.io import MemoryFile
 
     count, height, width = bands.shape
-    east_m, north_m = (_decimal(size) for size in np.asarray(grid.voxel_size_m)[:2])
-    west, south = (site_origin[axis] + _decimal(np.asarray(grid.origin_m)[axis]) for axis in (0, 1))
+    origin_m, (east_m, north_m, _) = exact_corner(grid)
+    west, south = site_origin[:2] + origin_m[:2]
     try:
         reference = CRS.from_user_input(crs) if crs else None
     except CRSError as error:
@@ -96,8 +97,3 @@ def _encode(
             raster.units = ("", "m", *("" for _ in classes))
             raster.update_tags(classes=json.dumps(list(classes)))
         return bytes(memory.getbuffer())
-
-
-def _decimal(number: np.float32) -> float:
-    """The short decimal a float32 stands for: 0.2, not 0.20000000298, as georeferences are read by people."""
-    return float(str(number))

@@ -34,6 +34,18 @@ def voxel_centres(grid: GridSpec) -> Float[Array, "X Y Z 3"]:
     return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
+def exact_corner(grid: GridSpec) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Origin and voxel size as the short decimals that their float32 stand for, float64: 0.2, not 0.20000000298.
+
+    Georeferences are read by people, and cells of 0.2 m must hold voxels of 0.05 m exactly.
+    """
+    origin_m, size_m = (
+        np.array([float(str(number)) for number in np.asarray(numbers, np.float32)])
+        for numbers in (grid.origin_m, grid.voxel_size_m)
+    )
+    return origin_m, size_m
+
+
 class Window(NamedTuple):
     """A part of a grid: the index of its first voxel, and the part as a grid of its own."""
 

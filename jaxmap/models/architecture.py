@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -25,10 +26,10 @@ MAX_CLASSES = 255
 class Architecture:
     """A DeepLab network, apart from its weights; stored in every model file.
 
-    Two families of detail exist. The fields' defaults are those of torch implementations
-    (segmentation_models_pytorch 0.6.0 `DeepLabV3Plus`); `tf_architecture` gives those of the
-    original TensorFlow networks (Chen et al. 2018, "Encoder-Decoder with Atrous Separable
-    Convolution").
+    Families of detail exist. The fields' defaults are those of segmentation_models_pytorch 0.6.0
+    (`DeepLabV3Plus`); `tf_architecture` gives those of the original TensorFlow networks (Chen et al.
+    2018, "Encoder-Decoder with Atrous Separable Convolution"), `torchvision_architecture` those of
+    torchvision's DeepLabv3 (Chen et al. 2017, "Rethinking Atrous Convolution").
 
     Attributes:
         backbone: what computes the features.
@@ -48,10 +49,10 @@ class Architecture:
         top_conv: whether MobileNetV2 keeps its last 1x1 convolution (to 1280 channels).
         head_channels: channels of ASPP and decoder.
         atrous_rates: dilations of the ASPP branches beside the 1x1 one; none at all is allowed.
-        separable_aspp: whether those branches are depthwise separable.
+        separable_aspp: whether those branches, and the convolution after the ASPP, are depthwise separable.
         pool_first: whether the pooled branch is concatenated first (TensorFlow) or last.
         norm_inside: whether batch norm and ReLU stand between depthwise and pointwise convolutions.
-        aspp_conv: whether a separable convolution follows the ASPP.
+        aspp_conv: whether a 3x3 convolution follows the ASPP.
         low_level_channels: channels the low-level feature is reduced to.
         decoder_convs: separable convolutions of the decoder.
         align_corners: whether bilinear resizing maps corner pixels onto corner pixels.
@@ -109,6 +110,8 @@ def tf_architecture(
 
     On MobileNetV2 the original goes without atrous branches and without the last convolution.
     Only MobileNetV2 pads as TensorFlow does by itself; Xception and ResNet pad both sides alike.
+    Backbones keep the layout of the weights that can be had for them: ResNet is torchvision's (stride in
+    a stage's first unit), and MobileNetV2's low-level feature is a unit's output (24 channels).
 
     Raises:
         JaxmapError: an unknown backbone or stride, or faulty classes.
@@ -139,6 +142,32 @@ def tf_architecture(
     )
 
 
+def torchvision_architecture(
+    backbone: str, classes: Sequence[str], *, output_stride: int = 8, where: object = "architecture"
+) -> Architecture:
+    """DeepLabv3 with the details of torchvision's `deeplabv3_resnet50` and `deeplabv3_resnet101`.
+
+    Published weights are for output stride 8. At 16 the rates are halved, so that the branches see as
+    far as before.
+
+    Raises:
+        JaxmapError: an unknown backbone or stride, or faulty classes.
+    """
+    return check_architecture(
+        Architecture(
+            backbone,  # type: ignore[arg-type]
+            tuple(classes),
+            output_stride,
+            decoder=False,
+            dilate_first=False,
+            atrous_rates=(12, 24, 36) if output_stride == 8 else (6, 12, 18),
+            separable_aspp=False,
+            align_corners=False,
+        ),
+        where,
+    )
+
+
 def check_architecture(architecture: Architecture, where: object = "architecture") -> Architecture:
     """Returns the record where it describes a network that can be built.
 
@@ -155,19 +184,22 @@ def check_architecture(architecture: Architecture, where: object = "architecture
     if record.size_remainder not in (0, 1):
         faults.append(f"size_remainder {record.size_remainder} is neither 0 nor 1")
     names = record.classes
-    if not 1 <= len(names) <= MAX_CLASSES or len(set(names)) != len(names) or not all(names):
-        faults.append(f"classes must be 1 to {MAX_CLASSES} different names, not {list(names)[:8]}")
-    for name in ("head_channels", "low_level_channels", "decoder_convs"):
-        if not 1 <= getattr(record, name) <= 4096:
-            faults.append(f"{name} {getattr(record, name)} is not between 1 and 4096")
+    told = [name if len(name) <= 40 else f"{name[:40]}..." for name in names[:6]]
+    readable = all(name.strip() and name.isprintable() for name in names)
+    if not 1 <= len(names) <= MAX_CLASSES or len(set(names)) != len(names) or not readable:
+        faults.append(f"classes must be 1 to {MAX_CLASSES} different printable names, not {told}")
+    for name, most in (("head_channels", 4096), ("low_level_channels", 4096), ("decoder_convs", 16)):
+        if not 1 <= getattr(record, name) <= most:
+            faults.append(f"{name} {getattr(record, name)} is not between 1 and {most}")
     if any(not 1 <= rate <= 1024 for rate in record.atrous_rates) or len(record.atrous_rates) > 16:
         faults.append(f"atrous_rates {list(record.atrous_rates)} are not up to 16 numbers from 1 to 1024")
-    if not (record.backbone_eps > 0 and record.head_eps > 0):
-        faults.append("the epsilons of batch norm must be positive")
+    if not (0 < record.backbone_eps < 1 and 0 < record.head_eps < 1):
+        faults.append("the epsilons of batch norm must be between 0 and 1")
     if not 0 <= record.dropout < 1:
         faults.append(f"dropout {record.dropout} is not in [0, 1)")
-    if len(record.mean) != 3 or len(record.std) != 3 or not all(value > 0 for value in record.std):
-        faults.append("mean and std must be three numbers each, std above 0")
+    finite = all(math.isfinite(value) for value in (*record.mean, *record.std))
+    if len(record.mean) != 3 or len(record.std) != 3 or not finite or min(record.std) <= 0:
+        faults.append("mean and std must be three finite numbers each, std above 0")
     if faults:
         raise JaxmapError("; ".join(faults), where=where, fix="correct the architecture")
     return record

@@ -7,8 +7,10 @@ The metadata key `jaxmap` holds JSON: `format_version`, `architecture` (the fiel
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -20,7 +22,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.files import atomic_path
 from jaxmap.models.architecture import Architecture, check_architecture
 from jaxmap.models.deeplab import Weights, weight_shapes
-from jaxmap.models.tensor_files import read_safetensors, shortened
+from jaxmap.models.tensor_files import as_float32, read_safetensors, shortened
 
 FORMAT_VERSION = 1
 
@@ -45,16 +47,18 @@ class SavedModel(NamedTuple):
 
 
 def save_model(
-    path: Path, architecture: Architecture, weights: Mapping[str, object], *, holds: Holds = "network"
+    path: str | PathLike[str], architecture: Architecture, weights: Mapping[str, object], *, holds: Holds = "network"
 ) -> None:
     """Writes a model file atomically.
 
     Raises:
-        JaxmapError: the weights are not those of the architecture, or writing failed.
+        JaxmapError: no such network can be built, the weights are not its own, or writing failed.
     """
+    from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
-    arrays = {name: np.ascontiguousarray(np.asarray(value, np.float32)) for name, value in weights.items()}
+    check_architecture(architecture, path)
+    arrays = {name: as_float32(np.asarray(value)) for name, value in weights.items()}
     check_weights(architecture, arrays, holds=holds, where=path)
     fields = dataclasses.asdict(architecture)
     record = {
@@ -65,23 +69,32 @@ def save_model(
         "normalisation": {"mean": list(architecture.mean), "std": list(architecture.std), "scale": "0 to 1, RGB"},
     }
     with atomic_path(path) as temporary:
-        save_file(arrays, temporary, metadata={"jaxmap": json.dumps(record)})
+        try:
+            save_file(arrays, temporary, metadata={"jaxmap": json.dumps(record)})
+        except SafetensorError as error:
+            # The library wraps what the operating system has said.
+            code = errno.ENOSPC if "os error 28" in str(error) else errno.EIO
+            raise OSError(code, str(error)) from error
 
 
-def load_model(path: Path) -> SavedModel:
+def load_model(path: str | PathLike[str]) -> SavedModel:
     """Reads a model file.
 
     Raises:
         JaxmapError: the file is missing, truncated, no model of jaxmap's, of a newer format, or its
             weights do not fit its architecture.
     """
+    path = Path(path)
+    if not path.is_file():
+        raise JaxmapError("no such model file", where=path, fix="convert one with jaxmap weights import")
     metadata, tensors = read_safetensors(path)
     architecture, holds = _read_record(metadata, path)
+    tensors = {name: as_float32(value) for name, value in tensors.items()}
     check_weights(architecture, tensors, holds=holds, where=path)
-    return SavedModel(architecture, {name: jnp.asarray(value, jnp.float32) for name, value in tensors.items()}, holds)
+    return SavedModel(architecture, {name: jnp.asarray(value) for name, value in tensors.items()}, holds)
 
 
-def load_network(path: Path) -> SavedModel:
+def load_network(path: str | PathLike[str]) -> SavedModel:
     """Reads a model file that must hold a whole network.
 
     Raises:
@@ -153,9 +166,11 @@ def _read_record(metadata: dict[str, str], path: Path) -> tuple[Architecture, Ho
     try:
         record = json.loads(metadata["jaxmap"])
         version = record["format_version"]
-        if not isinstance(version, int) or version > FORMAT_VERSION:
+        if not isinstance(version, int) or version < 1:
+            raise ValueError(f"format_version is {version!r}")
+        if version > FORMAT_VERSION:
             raise JaxmapError(
-                f"written by a newer jaxmap: format {version}, this one reads {FORMAT_VERSION}",
+                f"written by a newer jaxmap: format {str(version)[:20]}, this one reads {FORMAT_VERSION}",
                 where=path,
                 fix="upgrade jaxmap",
             )

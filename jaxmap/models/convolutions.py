@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from functools import cache, reduce
+from functools import cache, partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -16,10 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmap.models import convolution_gradients as gradients
 from jaxmap.models.architecture import Padding
-
-PRECISION = jax.lax.Precision.HIGHEST
-"""Full float32 products on accelerators too, where the default would cut the mantissa to 10 bits."""
+from jaxmap.models.convolution_gradients import PRECISION, Sliding
 
 FEW_CHANNELS = 4
 """An image's channels, as opposed to features: the library takes twice as long with so few as with twice as many."""
@@ -59,18 +58,23 @@ def convolve(
         depthwise: whether each channel has a kernel of its own.
         row_padding: zeros above and below, where only a band of an image's rows is given (depthwise only).
     """
-    if depthwise:
-        return depthwise_convolve(
-            images, kernel, stride=stride, dilation=dilation, padding=padding, row_padding=row_padding
-        )
     size = kernel.shape[0]
+    if depthwise:
+        forward = partial(
+            depthwise_convolve, stride=stride, dilation=dilation, padding=padding, row_padding=row_padding
+        )
+        top, left = (pad_amounts(images.shape[axis], size, stride, dilation, padding)[0] for axis in (1, 2))
+        top = top if row_padding is None else row_padding[0]
+        return gradients.depthwise(forward, Sliding(size, stride, dilation, (top, left)), images, kernel)
     if stride == 2 and size == 3 and images.shape[3] <= FEW_CHANNELS and images.shape[2] % 2 == 0:
         return _convolve_pairs(images, kernel, padding)
     if size == 1:
-        return jnp.dot(images[:, ::stride, ::stride], kernel[0, 0], precision=PRECISION)
+        return gradients.pointwise(images[:, ::stride, ::stride], kernel[0, 0])
+    # Other products promote by themselves, as double precision needs.
+    dtype = jnp.result_type(images, kernel)
     return jax.lax.conv_general_dilated(
-        images,
-        kernel,
+        images.astype(dtype),
+        kernel.astype(dtype),
         window_strides=(stride, stride),
         padding=[pad_amounts(images.shape[axis], size, stride, dilation, padding) for axis in (1, 2)],
         rhs_dilation=(dilation, dilation),
@@ -95,9 +99,10 @@ def _convolve_pairs(
     pairs = -(-(size + odd) // 2)
     kernel = jnp.pad(kernel, ((0, 0), (odd, 2 * pairs - size - odd), (0, 0), (0, 0)))
     first = (before + odd) // 2
+    dtype = jnp.result_type(images, kernel)
     return jax.lax.conv_general_dilated(
-        images.reshape(batch, height, width // 2, 2 * channels),
-        kernel.reshape(size, pairs, 2 * channels, outputs),
+        images.reshape(batch, height, width // 2, 2 * channels).astype(dtype),
+        kernel.reshape(size, pairs, 2 * channels, outputs).astype(dtype),
         window_strides=(2, 1),
         padding=[rows, (first, count + pairs - 1 - first - width // 2)],
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
@@ -214,6 +219,7 @@ def resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarr
     return low, np.minimum(low + 1, source - 1), (position - low).astype(np.float32)
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(1, 2, 3))
 def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> Array:
     source = images.shape[axis]
     if source == target:
@@ -225,8 +231,32 @@ def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> 
     return before + (jnp.take(images, high, axis=axis, mode="clip") - before) * shares
 
 
+def _resize_axis_forward(images: Array, target: int, axis: int, align_corners: bool) -> tuple[Array, Array]:
+    # Only the size of the axis is needed on the way back, which an empty array tells.
+    return _resize_axis(images, target, axis, align_corners), jnp.zeros((images.shape[axis], 0))
+
+
+def _resize_axis_backward(target: int, axis: int, align_corners: bool, before: Array, cotangent: Array) -> tuple[Array]:
+    source = len(before)
+    if source == target:
+        return (cotangent,)
+    return (gradients.resized(cotangent, resize_taps(source, target, align_corners), source, axis),)
+
+
+_resize_axis.defvjp(_resize_axis_forward, _resize_axis_backward)
+
+
 def resize_bilinear(
     images: Float[Array, "B H W C"], height: int, width: int, *, align_corners: bool
 ) -> Float[Array, "B h w C"]:
     """Bilinear resizing without antialiasing, as torch and TensorFlow do it."""
     return _resize_axis(_resize_axis(images, height, 1, align_corners), width, 2, align_corners)
+
+
+def resize_rows(matrix: Float[np.ndarray, "source N"], target: int, *, align_corners: bool) -> np.ndarray:
+    """What `resize_bilinear` does along one axis, on the host: (target, N), as precise as the matrix.
+
+    The identity becomes the matrix that takes the pixels there to those wanted.
+    """
+    low, high, share = resize_taps(len(matrix), target, align_corners)
+    return matrix[low] + (matrix[high] - matrix[low]) * share[:, None]

@@ -76,8 +76,10 @@ def padded_size(size: int, record: Architecture) -> int:
 
 def normalise(images: Images, record: Architecture) -> Float[Array, "B h w 3"]:
     """Images on the scale the network was trained on, padded below and to the right with zeros (the mean)."""
-    mean, std = (jnp.asarray(values, jnp.float32) * 255 for values in (record.mean, record.std))
-    scaled = (images.astype(jnp.float32) - mean) / std
+    # Whole numbers and halves become float32; float64, which checks of gradients need, stays.
+    dtype = jnp.promote_types(images.dtype, jnp.float32)
+    mean, std = (jnp.asarray(values, dtype) * 255 for values in (record.mean, record.std))
+    scaled = (images.astype(dtype) - mean) / std
     after = [padded_size(size, record) - size for size in images.shape[1:3]]
     return jnp.pad(scaled, ((0, 0), (0, after[0]), (0, after[1]), (0, 0)))
 
@@ -143,6 +145,37 @@ def pure_form(network: DeepLab) -> PureNetwork:
         return _filled(skeleton, weights).coarse_logits(images)
 
     return PureNetwork(network.record, network_weights(network), apply, apply_coarse)
+
+
+def training_form(
+    architecture: Architecture, batch_norms: tuple[str, ...]
+) -> Callable[[Weights, Images, PRNGKeyArray], tuple[Float[Array, "B H W C"], Weights]]:
+    """The network as it is trained: with dropout, and with batch norms that learn.
+
+    Args:
+        architecture: the network.
+        batch_norms: prefixes of the paths of batch norms that normalise by the statistics of the batch and
+            follow them; the others use the statistics they have.
+
+    Returns:
+        `(weights, images, dropout_key) -> (logits, statistics)`: the running statistics after the batch, by
+        dotted path.
+    """
+    skeleton = nnx.eval_shape(lambda: DeepLab(architecture))
+
+    def apply(weights: Weights, images: Images, dropout_key: PRNGKeyArray) -> tuple[Array, Weights]:
+        network = _filled(skeleton, weights)
+        learning = []
+        for path, module in nnx.iter_modules(network):
+            name = ".".join(map(str, path))
+            if isinstance(module, nnx.BatchNorm) and name.startswith(batch_norms):
+                module.use_running_average = False
+                learning += [f"{name}.mean", f"{name}.var"]
+        logits = network(images, dropout_key=dropout_key)
+        after = network_weights(network)
+        return logits, {name: after[name] for name in learning}
+
+    return apply
 
 
 def network_weights(network: DeepLab) -> Weights:

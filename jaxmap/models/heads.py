@@ -11,7 +11,8 @@ from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.convolutions import PRECISION, resize_bilinear
+from jaxmap.models.convolution_gradients import pointwise
+from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.layers import ConvBlock, SeparableBlock
 from jaxmap.models.upsampled import separable_on_upsampled
 
@@ -35,6 +36,12 @@ def _plain(inputs: int, outputs: int, record: Architecture, size: int = 1, dilat
     return ConvBlock(inputs, outputs, size, dilation=dilation, norm=norm, eps=record.head_eps)
 
 
+def _three_by_three(inputs: int, record: Architecture, dilation: int = 1) -> SeparableBlock | ConvBlock:
+    if record.separable_aspp:
+        return _separable(inputs, record, dilation)
+    return _plain(inputs, record.head_channels, record, 3, dilation)
+
+
 class Aspp(nnx.Module):
     """Branches that see the features at several scales, side by side, reduced to one depth."""
 
@@ -42,12 +49,9 @@ class Aspp(nnx.Module):
         channels = record.head_channels
         self.pool = _plain(inputs, channels, record)
         self.point = _plain(inputs, channels, record)
-        self.atrous = nnx.List(
-            _separable(inputs, record, rate) if record.separable_aspp else _plain(inputs, channels, record, 3, rate)
-            for rate in record.atrous_rates
-        )
+        self.atrous = nnx.List(_three_by_three(inputs, record, rate) for rate in record.atrous_rates)
         self.project = _plain((2 + len(record.atrous_rates)) * channels, channels, record)
-        self.refine = _separable(channels, record) if record.aspp_conv else None
+        self.refine = _three_by_three(channels, record) if record.aspp_conv else None
         self.pool_first, self.dropout = record.pool_first, record.dropout
 
     def __call__(
@@ -59,8 +63,7 @@ class Aspp(nnx.Module):
         branches = [pooled, *branches] if self.pool_first else [*branches, pooled]
         # Projected one by one: nothing need be joined, and the pooled branch is projected once, not for each pixel.
         kernels = jnp.split(self.project.kernel[0, 0], len(branches))
-        projected = [jnp.dot(branch, kernel, precision=PRECISION) for branch, kernel in zip(branches, kernels, strict=True)]
-        result = self.project.finish(reduce(jnp.add, projected))
+        result = self.project.finish(reduce(jnp.add, map(pointwise, branches, kernels)))
         if dropout_key is not None and self.dropout > 0:
             kept = jax.random.bernoulli(dropout_key, 1 - self.dropout, result.shape)
             result = jnp.where(kept, result / (1 - self.dropout), 0)

@@ -120,6 +120,18 @@ def smp_head(architecture: Architecture) -> Iterator[Row]:
     yield Row("classifier", "segmentation_head.0")
 
 
+def torchvision_head(architecture: Architecture) -> Iterator[Row]:
+    """The classifier of torchvision's `deeplabv3_resnet50` and `deeplabv3_resnet101`."""
+    aspp, rates = "classifier.0", len(architecture.atrous_rates)
+    yield Row("aspp.point", f"{aspp}.convs.0.0", f"{aspp}.convs.0.1")
+    for index in range(rates):
+        yield Row(f"aspp.atrous.{index}", f"{aspp}.convs.{index + 1}.0", f"{aspp}.convs.{index + 1}.1")
+    yield Row("aspp.pool", f"{aspp}.convs.{rates + 1}.1", f"{aspp}.convs.{rates + 1}.2")
+    yield Row("aspp.project", f"{aspp}.project.0", f"{aspp}.project.1")
+    yield Row("aspp.refine", "classifier.1", "classifier.2")
+    yield Row("classifier", "classifier.4")
+
+
 def tf_folded_mobilenet_v2(*, top: bool) -> Iterator[Row]:
     """`expanded_conv_N/{expand,depthwise,project}` of slim, batch norm folded."""
     yield Row("backbone.stem", "Conv")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,10 +13,15 @@ import numpy as np
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.models import import_tables as tables
-from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
+from jaxmap.models.architecture import (
+    Architecture,
+    tf_architecture,
+    torch_architecture,
+    torchvision_architecture,
+)
 from jaxmap.models.checkpoint import Holds, raise_mismatch
 from jaxmap.models.deeplab import weight_shapes
-from jaxmap.models.tensor_files import Tensors, read_tensors
+from jaxmap.models.tensor_files import Tensors, as_float32, read_tensors, shortened
 
 VOC_CLASSES: tuple[str, ...] = (
     *("background", "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow"),
@@ -45,27 +51,36 @@ class _Source(NamedTuple):
 
     name: str
     recognise: Callable[[Tensors], bool]
-    convert: Callable[[Tensors, Sequence[str] | None, int, Path], Imported]
+    convert: Callable[[Tensors, Sequence[str] | None, int | None, Path], Imported]
 
 
-def import_weights(path: Path, *, classes: Sequence[str] | None = None, output_stride: int = 16) -> Imported:
+DEFAULT_STRIDE = 16
+
+
+def import_weights(
+    path: str | PathLike[str], *, classes: Sequence[str] | None = None, output_stride: int | None = None
+) -> Imported:
     """Reads a public checkpoint and converts it.
 
     Args:
         path: `.safetensors`, or a PyTorch zip.
         classes: names of its classes in order; Pascal VOC's where there are 21, else `class_0` and on.
-        output_stride: the stride to run the network at; weights do not tell.
+        output_stride: the stride to run the network at, which weights do not tell; without it 8 for
+            torchvision's DeepLabv3, as it was trained, and 16 for all others.
 
     Raises:
         JaxmapError: the file cannot be read, is of no known kind, or its tensors are not those of
             the network it looks like (everything missing, left over or misshapen in one error).
     """
+    path = Path(path)
     tensors = _without_prefix(read_tensors(path))
+    if "backbone.stem.kernel" in tensors or "backbone.stem.0.kernel" in tensors:
+        raise JaxmapError("already a model file of jaxmap's", where=path, fix="use it as it is")
     for source in SOURCES:
         if source.recognise(tensors):
             return source.convert(tensors, classes, output_stride, path)
     raise JaxmapError(
-        f"weights of no known kind (the first is called {next(iter(tensors), 'nothing')!r})",
+        f"weights of no known kind (there is {shortened(list(tensors), 2) or 'nothing'})",
         where=path,
         fix=f"known are {', '.join(source.name for source in SOURCES)}",
     )
@@ -145,7 +160,7 @@ def convert(
         if array.shape != shape:
             misshapen.append(f"{source} gives {list(array.shape)}, not {list(shape)}")
             continue
-        result[name] = np.ascontiguousarray(array, np.float32)
+        result[name] = as_float32(array)
     left_over = [
         name
         for name in tensors
@@ -172,12 +187,12 @@ def _source_name(name: str, by_block: dict[str, tables.Row], naming: tables.Nami
     return None if row is None else row.convolution + (naming.kernel if leaf == "kernel" else naming.bias)
 
 
-def _from_smp(tensors: Tensors, classes: Sequence[str] | None, stride: int, path: Path) -> Imported:
+def _from_smp(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
     mobile = "encoder.features.0.0.weight" in tensors
     backbone = "mobilenet_v2" if mobile else _resnet_of(tensors, "encoder.", path)
     head = tensors.get("segmentation_head.0.weight")
     names = _class_names(len(head) if head is not None and head.ndim else 1, classes, path)
-    architecture = torch_architecture(backbone, names, output_stride=stride, where=path)
+    architecture = torch_architecture(backbone, names, output_stride=stride or DEFAULT_STRIDE, where=path)
     rows = [*tables.torchvision_backbone(backbone, "encoder."), *tables.smp_head(architecture)]
     weights = convert(
         tensors,
@@ -191,7 +206,21 @@ def _from_smp(tensors: Tensors, classes: Sequence[str] | None, stride: int, path
     return Imported(f"segmentation_models_pytorch DeepLabV3Plus, {backbone}", architecture, weights, "network")
 
 
-def _from_torchvision(tensors: Tensors, classes: Sequence[str] | None, stride: int, path: Path) -> Imported:
+def _from_torchvision_deeplab(
+    tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path
+) -> Imported:
+    backbone = _resnet_of(tensors, "backbone.", path)
+    head = tensors.get("classifier.4.bias")
+    names = _class_names(1 if head is None else head.size, classes, path)
+    architecture = torchvision_architecture(backbone, names, output_stride=stride or 8, where=path)
+    rows = [*tables.torchvision_resnet(backbone, "backbone."), *tables.torchvision_head(architecture)]
+    weights = convert(
+        tensors, rows, tables.TORCH, architecture, holds="network", where=path, ignored=("aux_classifier.",)
+    )
+    return Imported(f"torchvision DeepLabv3, {backbone}", architecture, weights, "network")
+
+
+def _from_torchvision(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
     mobile = "features.0.0.weight" in tensors
     backbone = "mobilenet_v2" if mobile else _resnet_of(tensors, "", path)
     return _torch_backbone(
@@ -199,7 +228,7 @@ def _from_torchvision(tensors: Tensors, classes: Sequence[str] | None, stride: i
     )
 
 
-def _from_timm(tensors: Tensors, classes: Sequence[str] | None, stride: int, path: Path) -> Imported:
+def _from_timm(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
     return _torch_backbone("timm", "mobilenet_v2", list(tables.timm_mobilenet_v2()), tensors, classes, stride, path)
 
 
@@ -209,25 +238,31 @@ def _torch_backbone(
     rows: list[tables.Row],
     tensors: Tensors,
     classes: Sequence[str] | None,
-    stride: int,
+    stride: int | None,
     path: Path,
 ) -> Imported:
-    architecture = torch_architecture(backbone, classes or ROVER_CLASSES, output_stride=stride, where=path)
+    architecture = torch_architecture(
+        backbone, classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path
+    )
     weights = convert(
         tensors, rows, tables.TORCH, architecture, holds="backbone", where=path, ignored=("classifier.", "fc.")
     )
     return Imported(f"{family} {backbone} backbone", architecture, weights, "backbone")
 
 
-def _from_tf_folded(tensors: Tensors, classes: Sequence[str] | None, stride: int, path: Path) -> Imported:
+def _from_tf_folded(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
     if "logits_semantic/bias" in tensors:
         names = _class_names(tensors["logits_semantic/bias"].size, classes, path)
-        plain = tf_architecture("mobilenet_v2", names, output_stride=stride, decoder=False, where=path)
+        plain = tf_architecture(
+            "mobilenet_v2", names, output_stride=stride or DEFAULT_STRIDE, decoder=False, where=path
+        )
         architecture = replace(plain, backbone_norm=False, head_norm=False)
         rows = [*tables.tf_folded_mobilenet_v2(top=False), *tables.tf_folded_head()]
         weights = convert(tensors, rows, tables.TENSORFLOW, architecture, holds="network", where=path)
         return Imported("TensorFlow DeepLabv3, mobilenet_v2, folded", architecture, weights, "network")
-    plain = tf_architecture("mobilenet_v2", classes or ROVER_CLASSES, output_stride=stride, where=path)
+    plain = tf_architecture(
+        "mobilenet_v2", classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path
+    )
     architecture = replace(plain, top_conv=True, backbone_norm=False)
     rows = list(tables.tf_folded_mobilenet_v2(top=True))
     weights = convert(tensors, rows, tables.TENSORFLOW, architecture, holds="backbone", where=path)
@@ -239,6 +274,11 @@ SOURCES = (
         "segmentation_models_pytorch DeepLabV3Plus",
         lambda tensors: any(name.startswith("decoder.aspp.") for name in tensors),
         _from_smp,
+    ),
+    _Source(
+        "torchvision deeplabv3_resnet50 and deeplabv3_resnet101",
+        lambda tensors: "classifier.0.convs.0.0.weight" in tensors and "backbone.conv1.weight" in tensors,
+        _from_torchvision_deeplab,
     ),
     _Source("timm mobilenetv2_100", lambda tensors: "conv_stem.weight" in tensors, _from_timm),
     _Source(

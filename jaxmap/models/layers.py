@@ -6,22 +6,15 @@ a file replaces.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Activation, Norm, Padding
-from jaxmap.models.convolutions import PRECISION, convolve
+from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
+from jaxmap.models.convolution_gradients import pointwise
+from jaxmap.models.convolutions import convolve
 from jaxmap.models.winograd import MIN_CHANNELS, convolve_transformed
-
-ACTIVATIONS: dict[Activation, Callable[[Array], Array]] = {
-    "relu": jax.nn.relu,
-    "relu6": jax.nn.relu6,
-    "none": lambda values: values,
-}
 
 BATCH_NORM_MOMENTUM = 0.9
 """Weight of the old running statistics; torch calls the same 0.1."""
@@ -54,9 +47,7 @@ class ConvBlock(nnx.Module):
         self.kernel = nnx.Param(jnp.zeros((size, size, 1 if depthwise else inputs, outputs)))
         self.bias = nnx.Param(jnp.zeros(outputs)) if norm == "bias" else None
         self.norm = (
-            nnx.BatchNorm(
-                outputs, use_running_average=True, momentum=BATCH_NORM_MOMENTUM, epsilon=eps, rngs=nnx.Rngs(0)
-            )
+            BatchNorm(outputs, use_running_average=True, momentum=BATCH_NORM_MOMENTUM, epsilon=eps, rngs=nnx.Rngs(0))
             if norm == "batch"
             else None
         )
@@ -93,10 +84,10 @@ class ConvBlock(nnx.Module):
     def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
         """What follows the convolution: bias or norm, then the activation."""
         if self.bias is not None:
-            images = images + self.bias[...]
+            return add_bias(images, self.bias[...], self.activation)
         if self.norm is not None:
-            images = self.norm(images)
-        return ACTIVATIONS[self.activation](images)
+            return self.norm(images, self.activation)
+        return activate(images, self.activation)
 
 
 class SeparableBlock(nnx.Module):
@@ -139,7 +130,7 @@ class SeparableBlock(nnx.Module):
         if inner.linear and inner.dilation >= max(images.shape[1:3]):
             # Only the middle of the kernel meets the image.
             kernel = inner.kernel[1, 1, 0][:, None] * outer.kernel[0, 0]
-            return outer.finish(jnp.dot(images, kernel, precision=PRECISION))
+            return outer.finish(pointwise(images, kernel))
         return outer(inner(images))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,8 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], Tensors]:
             _refuse_types(types, path)
             tensors = {name: file.get_tensor(name) for name, kind in types.items() if kind in _FLOATS}
             return dict(file.metadata() or {}), tensors
-    except SafetensorError as fault:
+    except (SafetensorError, ValueError, MemoryError) as fault:
+        # NumPy has its own limits: a tensor of more than 64 axes is well-formed, but no array.
         raise JaxmapError(
             f"not a whole safetensors file ({_reason(fault)})",
             where=path,
@@ -69,7 +71,14 @@ def _reason(fault: Exception) -> str:
     return " ".join(str(fault).split())[:120]
 
 
-def shortened(items: list[str], at_most: int = 3) -> str:
-    """The first of them, and how many more there are."""
+def shortened(items: Sequence[str], at_most: int = 3, length: int = 100) -> str:
+    """The first of them, each cut to `length`, and how many more there are."""
     more = f" and {len(items) - at_most} more" if len(items) > at_most else ""
-    return ", ".join(items[:at_most]) + more
+    told = (item if len(item) <= length else f"{item[:length]}..." for item in items[:at_most])
+    return ", ".join(told) + more
+
+
+def as_float32(array: np.ndarray) -> np.ndarray:
+    """The array in float32; what is too large for it becomes infinite, and is told with what is not finite."""
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(array, np.float32)

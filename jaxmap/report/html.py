@@ -15,6 +15,7 @@ from jaxmap.files import atomic_path
 from jaxmap.report.inline import inline_image, script_text
 from jaxmap.report.page import page
 from jaxmap.report.run_contents import PICTURE_KINDS, RunContents, read_run
+from jaxmap.report.score_section import score_section
 from jaxmap.report.tables import group, metric_tables
 from jaxmap.report.voxel_view import voxel_view
 from jaxmap.report.wording import value_text
@@ -30,6 +31,8 @@ _FILES = {
     "poses.tum": "poses of the left camera",
     "metrics.json": "all numbers of this page",
     "config.yaml": "the configuration",
+    "scores.json": "scores against ground truth",
+    "errors.png": "where map and ground truth differ, picture",
 }
 _KIND_CAPTIONS = {"left": "Left image", "disparity": "Disparity, near red to far blue", "labels": "Labels"}
 
@@ -48,6 +51,7 @@ def write_report(run: Path) -> Path:
     sections = [
         _header(folder, voxels),
         _from_above(folder, remarks),
+        score_section(folder.path, remarks),
         in_3d(folder, voxels),
         _key_frames(folder, remarks),
         f"<section><h2>Figures</h2>{metric_tables(folder.metrics, folder.voxel_map.classes)}</section>",
@@ -72,6 +76,7 @@ def _header(folder: RunContents, voxels: OccupiedVoxels) -> str:
     facts = [
         sequence.get("dataset"),
         f"labels: {metrics['labeller']}" if metrics.get("labeller") else None,
+        Path(str(model)).name if (model := group(metrics, "model").get("file")) else None,
         sequence.get("crs") or folder.attributes.crs,
     ]
     progress = folder.attributes.progress

@@ -275,9 +275,9 @@ def test_readers_can_be_added_once(tmp_path, monkeypatch):
     monkeypatch.setattr("jaxmap.datasets.registry.READERS", dict(READERS))
     folder = plain_folder(tmp_path)
     opened = open_sequence(folder)
-    (tmp_path / "LocCam").mkdir()
+    (tmp_path / "HazCam").mkdir()
     rover = Reader(
-        "rover", "a folder with LocCam", lambda path: (path / "LocCam").is_dir(), lambda path, options: opened
+        "rover", "a folder with HazCam", lambda path: (path / "HazCam").is_dir(), lambda path, options: opened
     )
     register(rover)
     assert open_sequence(tmp_path) is opened

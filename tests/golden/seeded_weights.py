@@ -27,7 +27,7 @@ def seeded_tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
         return draw.uniform(0.5, 0.9, shape).astype(np.float32)
     fan_in = int(np.prod(shape[1:]))
     kernel = draw.normal(0, np.sqrt(2 / fan_in), shape)
-    if name.startswith("segmentation_head"):
+    if name.startswith(("segmentation_head", "classifier.4.")):
         # Features are positive: without this one class would win everywhere.
         kernel = 4 * (kernel - kernel.mean(axis=1, keepdims=True))
     return kernel.astype(np.float32)

@@ -166,4 +166,4 @@ def test_no_json_and_no_record_are_refused(path, weights):
     save_file(dict(weights), path)
     assert "weights import" in refusal(path)
     path.unlink()
-    assert "no such file" in refusal(path)
+    assert "no such model file" in refusal(path)

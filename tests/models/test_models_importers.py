@@ -11,9 +11,14 @@ from safetensors.numpy import save_file
 
 from jaxmap.errors import JaxmapError
 from jaxmap.models import import_tables as tables
-from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
+from jaxmap.models.architecture import (
+    Architecture,
+    tf_architecture,
+    torch_architecture,
+    torchvision_architecture,
+)
 from jaxmap.models.deeplab import weight_shapes
-from jaxmap.models.importers import VOC_CLASSES, import_weights
+from jaxmap.models.importers import VOC_CLASSES, convert, import_weights
 
 
 def same(ours: dict[str, np.ndarray], architecture: Architecture, holds: str) -> bool:
@@ -31,6 +36,84 @@ def test_torchvision_backbones(backbone, tmp_path):
     imported = import_weights(tmp_path / "a.safetensors")
     assert imported.architecture == architecture and imported.holds == "backbone"
     assert same(imported.weights, architecture, "backbone")
+
+
+def timm_mobilenet_names() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of timm's `mobilenetv2_100`, written from its published layout, not from our table."""
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def add(convolution: str, norm: str, *shape: int) -> None:
+        shapes[f"{convolution}.weight"] = shape
+        for leaf in ("weight", "bias", "running_mean", "running_var"):
+            shapes[f"{norm}.{leaf}"] = (shape[0],)
+        shapes[f"{norm}.num_batches_tracked"] = ()
+
+    add("conv_stem", "bn1", 32, 3, 3, 3)
+    add("blocks.0.0.conv_dw", "blocks.0.0.bn1", 32, 1, 3, 3)
+    add("blocks.0.0.conv_pw", "blocks.0.0.bn2", 16, 32, 1, 1)
+    before = 16
+    for stage, (after, units) in enumerate(((24, 2), (32, 3), (64, 4), (96, 3), (160, 3), (320, 1)), start=1):
+        for unit in range(units):
+            block, wide = f"blocks.{stage}.{unit}", 6 * before
+            add(f"{block}.conv_pw", f"{block}.bn1", wide, before, 1, 1)
+            add(f"{block}.conv_dw", f"{block}.bn2", wide, 1, 3, 3)
+            add(f"{block}.conv_pwl", f"{block}.bn3", after, wide, 1, 1)
+            before = after
+    add("conv_head", "bn2", 1280, 320, 1, 1)
+    return shapes | {"classifier.weight": (1000, 1280), "classifier.bias": (1000,)}
+
+
+def test_the_names_of_timm_are_covered():
+    shapes = timm_mobilenet_names()
+    architecture = torch_architecture("mobilenet_v2", ("a",))
+    state = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    rows = list(tables.timm_mobilenet_v2())
+    converted = convert(
+        state, rows, tables.TORCH, architecture, holds="backbone", where="timm", ignored=("classifier.",)
+    )
+    assert all(name.startswith("backbone.") for name in converted)
+    with pytest.raises(JaxmapError, match=r"2 left over: classifier\.weight, classifier\.bias"):
+        convert(state, rows, tables.TORCH, architecture, holds="backbone", where="timm")
+
+
+@pytest.mark.parametrize("backbone", ["resnet18", "resnet50", "resnet101"])
+def test_timm_calls_resnets_as_torchvision_does_and_names_what_is_missing(backbone, tmp_path):
+    architecture = torch_architecture(backbone, ("background", "sand", "rock"))
+    source = exported(architecture, list(tables.torchvision_backbone(backbone)), tables.TORCH)
+    source |= {"fc.weight": np.zeros((10, 4), np.float32), "fc.bias": np.zeros(10, np.float32)}
+    save_file(source, tmp_path / "a.safetensors")
+    assert same(import_weights(tmp_path / "a.safetensors").weights, architecture, "backbone")
+    # resnet50d of timm has a stem of three convolutions.
+    stem = source.pop("conv1.weight")
+    source |= {"conv1.0.weight": stem[:32, :, :3, :3], "conv1.3.weight": np.zeros((32, 32, 3, 3), np.float32)}
+    save_file({name: np.ascontiguousarray(value) for name, value in source.items()}, tmp_path / "d.safetensors")
+    with pytest.raises(JaxmapError, match=r"1 missing: conv1\.weight; 2 left over: conv1\.0\.weight, conv1\.3\.weight"):
+        import_weights(tmp_path / "d.safetensors")
+
+
+@pytest.mark.parametrize("backbone", ["resnet50", "resnet101"])
+@pytest.mark.parametrize("stride", [None, 16])
+def test_torchvision_networks(backbone, stride, tmp_path):
+    architecture = torchvision_architecture(backbone, VOC_CLASSES, output_stride=stride or 8)
+    rows = [*tables.torchvision_backbone(backbone, "backbone."), *tables.torchvision_head(architecture)]
+    source = exported(architecture, rows, tables.TORCH)
+    source["aux_classifier.0.weight"] = np.zeros((256, 1024, 3, 3), np.float32)
+    save_file(source, tmp_path / "a.safetensors")
+    imported = import_weights(tmp_path / "a.safetensors", output_stride=stride)
+    assert imported.architecture == architecture and same(imported.weights, architecture, "network")
+    assert imported.architecture.atrous_rates == ((12, 24, 36) if stride is None else (6, 12, 18))
+
+
+@pytest.mark.realdata
+def test_torchvision_names_agree_with_the_published_list(realdata):
+    file = realdata / "weights" / "state_dict_names" / "torchvision_deeplabv3_resnet50.txt"
+    if not file.exists():
+        pytest.skip(f"no {file}")
+    architecture = torchvision_architecture("resnet50", VOC_CLASSES)
+    rows = [*tables.torchvision_backbone("resnet50", "backbone."), *tables.torchvision_head(architecture)]
+    ours = {name: str(value.shape) for name, value in exported(architecture, rows, tables.TORCH).items()}
+    lines = [line.split("\t") for line in file.read_text().splitlines()]
+    assert ours == {name: shape for name, shape, _ in lines if not name.startswith("aux_classifier.")}
 
 
 def test_timm_mobilenet(tmp_path):

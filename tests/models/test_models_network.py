@@ -142,18 +142,16 @@ def check_gradient(make, call):
 
         leaves, tree = jax.tree.flatten(state)
         step = jax.tree.unflatten(tree, [draw.normal(size=leaf.shape) for leaf in leaves])
-        _, slope = jax.jvp(loss, (state,), (step,))
         gradient = jax.tree.leaves(jax.jit(jax.grad(loss))(state))
         backward = sum(float((one * other).sum()) for one, other in zip(gradient, jax.tree.leaves(step), strict=True))
         ahead, behind = (loss(jax.tree.map(lambda a, b, s=s: a + s * b, state, step)) for s in (1e-7, -1e-7))
-    assert abs(slope) > 1e-3
-    np.testing.assert_allclose(backward, slope, rtol=1e-9)
-    np.testing.assert_allclose((ahead - behind) / 2e-7, slope, rtol=1e-5)
+    assert abs(backward) > 1e-3
+    np.testing.assert_allclose((ahead - behind) / 2e-7, backward, rtol=1e-5)
 
 
 def test_faults_of_an_architecture_are_told_together():
     faulty = replace(SMALL, backbone="vgg", output_stride=4, classes=("a", "a"), std=(1.0, 0.0, 1.0))
     with pytest.raises(JaxmapError) as caught:
         check_architecture(faulty)
-    for word in ("vgg", "output_stride 4", "different names", "std"):
+    for word in ("vgg", "output_stride 4", "different printable names", "std"):
         assert word in str(caught.value)

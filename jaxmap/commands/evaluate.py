@@ -1,0 +1,163 @@
+"""`jaxmap evaluate`: scores a map against ground truth seen from above."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxmap.commands.console import Console, parse
+from jaxmap.errors import JaxmapError, UsageError
+
+
+@dataclass(frozen=True)
+class EvaluateArguments:
+    """Score the map of a run against ground truth seen from above.
+
+    Cells count where the map observed a surface and the truth is labelled; the second row counts every labelled cell
+    in the cameras' view, with unobserved ones as not rock. Writes scores.json and errors.png (true, false and missed
+    rock in colours) into the run folder and its report, or --out and OUT_errors.png.
+    """
+
+    run: tyro.conf.Positional[Path]
+    """A run folder, as jaxmap map has written it."""
+    ground_truth: tyro.conf.Positional[tuple[Path, ...]]
+    """A labelled orthomosaic (GeoTIFF: 0 unlabelled, 1 sand, 2 rock), or text files of rocks (x y [diameter in m]),
+    or a folder of those."""
+    out: Path | None = None
+    """JSON file to write; by default scores.json in the run folder."""
+    target: Annotated[str, tyro.conf.arg(name="class")] = "rock"
+    """The class that is scored."""
+    rock_fraction: float = 0.5
+    """A cell is rock where rock covers this share: in the truth of its labelled area, in the map of its area."""
+    cell_size_m: float = 0.2
+    """Edge of a cell."""
+    max_range_m: float | None = None
+    """Count only cells that a camera looked at from so near."""
+    register: bool = False
+    """Shift (to 0.5 m) and turn (to 2 degrees) the truth to where it fits best; reported with the scores before."""
+    remap: tuple[str, ...] = ()
+    """What the values of the orthomosaic mean: 0=unlabelled 7=rock '*=sand', or colours: '#b23c2e=rock'."""
+    palette: Path | None = None
+    """The same as a YAML file of CODE: CLASS."""
+    truth_crs: str | None = None
+    """Coordinate reference system of the ground truth, in place of its own."""
+    rock_diameters_m: tuple[float, float, float] = (0.3, 0.6, 1.0)
+    """Diameters of small, medium and large rocks in lists that give none."""
+    found_share: float = 0.5
+    """A rock is found where this share of its area lies in cells called rock."""
+    backdrop: Path | None = None
+    """An RGB orthomosaic to draw the errors on."""
+
+
+COLUMNS = {
+    "over": "counted",
+    "accuracy": "accuracy",
+    "iou": "IoU",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+    "coverage": "coverage",
+    "tp": "TP",
+    "fp": "FP",
+    "fn": "FN",
+    "tn": "TN",
+    "nll": "NLL",
+    "brier": "Brier",
+    "ece": "ECE",
+}
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    arguments = parse(EvaluateArguments, "evaluate", words)
+    if not arguments.ground_truth:
+        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
+    if arguments.remap and arguments.palette is not None:
+        raise UsageError("--remap and --palette exclude each other", fix="give one of them")
+    if arguments.out is not None and arguments.out.suffix.lower() != ".json":
+        raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
+    if min(arguments.rock_diameters_m) <= 0:
+        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
+
+    from jaxmap.cache import keep_compiled_programs
+    from jaxmap.datasets.label_coding import DEFAULT_CODING, parse_coding, read_coding
+    from jaxmap.datasets.rock_list import SIZE_CLASSES
+    from jaxmap.evaluation.evaluate import ScoringOptions
+    from jaxmap.map_evaluation import TruthOptions, evaluate_run, summary, write_evaluation
+    from jaxmap.run_folder import RunFolder
+
+    keep_compiled_programs()
+    console = Console()
+    coding = DEFAULT_CODING
+    if arguments.remap:
+        coding = parse_coding(arguments.remap)
+    elif arguments.palette is not None:
+        coding = read_coding(arguments.palette)
+    diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
+    evaluation, class_map = evaluate_run(
+        arguments.run,
+        arguments.ground_truth,
+        TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m),
+        ScoringOptions(
+            cell_size_m=arguments.cell_size_m,
+            rock_fraction=arguments.rock_fraction,
+            max_range_m=arguments.max_range_m,
+            register=arguments.register,
+            found_share=arguments.found_share,
+        ),
+    )
+    scores = evaluation.scores
+    folder = RunFolder(arguments.run)
+    out, picture = folder.scores, folder.errors
+    if arguments.out is not None:
+        out, picture = arguments.out, arguments.out.with_name(f"{arguments.out.stem}_errors.png")
+    write_evaluation(out, picture, evaluation, class_map, arguments.backdrop)
+    for note in scores["notes"]:
+        console.tell(f"note: {note}")
+    _print_scores(console, scores, summary(scores))
+    names = [out.name, picture.name]
+    if arguments.out is None and folder.metrics.is_file():
+        names += _report_anew(console, arguments.run)
+    console.result(out.parent, names)
+    return 0
+
+
+def _report_anew(console: Console, run: Path) -> list[str]:
+    """Puts the scores into the report of the run; a run that is not whole has none."""
+    from jaxmap.report.html import write_report
+
+    try:
+        return [write_report(run).name]
+    except JaxmapError as error:
+        console.tell(f"note: the report was not written anew: {error}")
+        return []
+
+
+def _print_scores(console: Console, scores: dict, title: str) -> None:
+    rows = [{"over": "observed cells", **scores}, {"over": "all cells in view", **scores["in_view"]}]
+    if moved := scores.get("registration"):
+        rows.append({"over": "observed, before registration", **moved["before"]})
+        console.tell(
+            f"registered: truth shifted {moved['shift_east_m']:+.3f} m east, {moved['shift_north_m']:+.3f} m north, "
+            f"turned {moved['heading_deg']:+.2f} degrees"
+        )
+    console.table(title, COLUMNS, [{key: _shown(row[key]) for key in COLUMNS} for row in rows])
+    rocks = [
+        {"rocks": f"{heading} {_span(row)} m", "count": row["count"], "missed": row["missed"]}
+        for key, heading in (("by_diameter_m", "diameter"), ("by_range_m", "nearest camera at"))
+        for row in scores["rocks"][key]
+    ]
+    if rocks:
+        console.table("rocks in view", {"rocks": "rocks", "count": "true", "missed": "missed"}, rocks)
+
+
+def _span(row: dict) -> str:
+    return f"{row['from']:g} to {row['to']:g}" if row["to"] is not None else f"over {row['from']:g}"
+
+
+def _shown(value: object) -> object:
+    return "-" if value is None else value

@@ -1,0 +1,83 @@
+"""`jaxmap train`: trains or fine-tunes DeepLabv3+."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxmap.commands.console import Console, parse
+from jaxmap.errors import UsageError
+from jaxmap.training_config import TrainConfig, check_train_config, load_train_config, train_config_tree
+
+OUTPUTS = ("report.html", "model.safetensors", "history.csv", "metrics.json", "config.yaml", "checkpoints/")
+
+
+@dataclass(frozen=True)
+class TrainArguments:
+    """Train or fine-tune DeepLabv3+ on images and masks.
+
+    The folder holds images/NAME.{png,jpg,...} and masks/NAME.png, and may hold train.txt and val.txt of names.
+    Writes into the run folder: model.safetensors, history.csv, metrics.json, config.yaml, report.html and
+    checkpoints/, from which an interrupted run goes on exactly (--resume).
+    """
+
+    data_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")]
+    """Folder of the training data."""
+    out: Path
+    """The run folder to write."""
+    init: Path | None = None
+    """Model file to start from: a backbone or a whole network, as train and weights write it."""
+    config: str | None = None
+    """YAML file, or the name of one in configs/train (chiodini2020); options given here go before it."""
+    resume: bool = False
+    """Go on with an interrupted run."""
+    overwrite: bool = False
+    """Replace a run that lies in the folder."""
+    settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    arguments = parse(TrainArguments, "train", words, with_config=_with_config)
+    config = check_train_config(train_config_tree(arguments.settings))
+    if arguments.resume and arguments.overwrite:
+        raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
+
+    from jaxmap.cache import keep_compiled_programs
+    from jaxmap.output_folder import locked
+    from jaxmap.training_folder import TrainingFolder
+    from jaxmap.training_plan import plan_training
+    from jaxmap.training_run import TrainingRun
+
+    keep_compiled_programs()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    console = Console()
+    plan = plan_training(arguments.data_folder, config, arguments.init, tell=console.tell)
+    folder = TrainingFolder(arguments.out)
+    with locked(arguments.out):
+        folder.begin(plan, resume=arguments.resume, overwrite=arguments.overwrite)
+        with console.steps("training", "steps", plan.order.steps) as advance:
+            metrics = TrainingRun(plan, folder, tell=console.tell, on_step=advance).run()
+    console.tell(_summary(metrics))
+    console.result(arguments.out, OUTPUTS)
+    return 0
+
+
+def _summary(metrics: dict) -> str:
+    rate = metrics["examples_seen"] / max(metrics["seconds"], 1e-9)
+    line = f"{metrics['epochs']} epochs: {metrics['examples_seen']} examples, {rate:.1f} a second"
+    if metrics["kept_epoch"] is not None:
+        kept = metrics["last"] if metrics["kept_epoch"] == metrics["last"]["epoch"] else metrics["best"]
+        iou = "unknown" if kept["mean_iou"] is None else f"{kept['mean_iou']:.3f}"
+        line += f"; kept: epoch {metrics['kept_epoch']}, mean IoU {iou}"
+    return line
+
+
+def _with_config(name: str) -> TrainArguments:
+    """The defaults under a configuration; the two required arguments are filled in by the parser."""
+    return TrainArguments(data_folder=tyro.MISSING, out=tyro.MISSING, config=name, settings=load_train_config(name))

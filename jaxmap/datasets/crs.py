@@ -1,0 +1,130 @@
+"""Coordinate reference systems: points and extents taken from one into another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxmap.errors import JaxmapError
+
+if TYPE_CHECKING:
+    import pyproj
+
+Points = Float64[np.ndarray, "*s"]
+Transform = Callable[[Points, Points], tuple[Points, Points]]
+"""Takes x (east, or longitude) and y (north, or latitude) of one system to those of another."""
+
+_EDGE_POINTS = 21
+
+
+class Extent(NamedTuple):
+    """A box in a coordinate reference system (None: of unknown system), in its units."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+    crs: str | None = None
+
+    def overlaps(self, other: Extent) -> bool:
+        """Whether two boxes of one system share an area."""
+        return (
+            self.west < other.east and other.west < self.east and self.south < other.north and other.south < self.north
+        )
+
+    def grown(self, margin: float) -> Extent:
+        """The box with a margin on all sides."""
+        return Extent(self.west - margin, self.south - margin, self.east + margin, self.north + margin, self.crs)
+
+    def text(self) -> str:
+        """The box in words."""
+        west, south, east, north = (f"{value:.9g}" for value in self[:4])
+        return f"{west} to {east} east, {south} to {north} north"
+
+
+def read_crs(name: str, where: object) -> pyproj.CRS:
+    """The system of a name (EPSG:32631), WKT or PROJ string.
+
+    Raises:
+        JaxmapError: no such system.
+    """
+    import pyproj
+    from pyproj.exceptions import CRSError
+
+    try:
+        return pyproj.CRS.from_user_input(name)
+    except CRSError as error:
+        raise JaxmapError(
+            f"unknown coordinate reference system {name[:60]!r}", where=where, fix='give a name such as "EPSG:32631"'
+        ) from error
+
+
+def crs_text(name: str | None) -> str:
+    """A short name of a system: `EPSG:32631` where it has one."""
+    if name is None:
+        return "no CRS"
+    system = read_crs(name, "coordinate reference system")
+    authority = system.to_authority(min_confidence=70)
+    return ":".join(authority) if authority else system.name
+
+
+def transform_between(source: str | None, target: str | None, where: object) -> Transform:
+    """How points of one system are found in another; nothing changes where they are one, or one is unknown.
+
+    x is always east or longitude, whatever the order that the authority prescribes. Points that have no place in
+    the target become infinite.
+
+    Raises:
+        JaxmapError: an unknown system, or no way between the two.
+    """
+    if source is None or target is None or source == target:
+        return lambda x, y: (x, y)
+    import pyproj
+    from pyproj.exceptions import ProjError
+
+    known = read_crs(source, where), read_crs(target, where)
+    if known[0] == known[1]:
+        return lambda x, y: (x, y)
+    try:
+        transformer = pyproj.Transformer.from_crs(*known, always_xy=True)
+    except ProjError as error:
+        raise JaxmapError(
+            f"no way from {known[0].name} to {known[1].name}", where=where, fix="reproject the ground truth"
+        ) from error
+
+    def transform(x: Points, y: Points) -> tuple[Points, Points]:
+        moved_x, moved_y = transformer.transform(x, y)
+        return np.asarray(moved_x), np.asarray(moved_y)
+
+    return transform
+
+
+def extent_in(extent: Extent, crs: str | None, where: object) -> Extent:
+    """The box around an extent in another system, found from points along its edges.
+
+    Raises:
+        JaxmapError: it has no place there.
+    """
+    along = np.linspace(0.0, 1.0, _EDGE_POINTS)
+    x = extent.west + (extent.east - extent.west) * along
+    y = extent.south + (extent.north - extent.south) * along
+    # The inside too: a box over a pole has its extreme there.
+    grid_x, grid_y = np.meshgrid(x, y)
+    moved_x, moved_y = transform_between(extent.crs, crs, where)(grid_x.ravel(), grid_y.ravel())
+    fine = np.isfinite(moved_x) & np.isfinite(moved_y)
+    if not fine.any():
+        raise JaxmapError(
+            f"the extent {extent.text()} has no place in {crs_text(crs)}",
+            where=where,
+            fix="check the coordinate reference systems",
+        )
+    return Extent(
+        float(moved_x[fine].min()),
+        float(moved_y[fine].min()),
+        float(moved_x[fine].max()),
+        float(moved_y[fine].max()),
+        crs,
+    )

@@ -1,0 +1,144 @@
+"""How the numbers or colours of a labelled orthomosaic are read as classes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int, UInt8
+
+from jaxmap.datasets.label_raster import OTHER, TARGET, UNLABELLED
+from jaxmap.errors import JaxmapError, UsageError
+
+UNLABELLED_NAME = "unlabelled"
+_REST = "*"
+_TOLD = 8
+
+
+@dataclass(frozen=True)
+class LabelCoding:
+    """Class names by code; a colour is the code `red << 16 | green << 8 | blue`.
+
+    Attributes:
+        names: class by code; `unlabelled` for what is no ground truth.
+        colours: whether the codes are colours.
+        rest: the class of all other codes; without it they are refused.
+    """
+
+    names: Mapping[int, str]
+    colours: bool = False
+    rest: str | None = None
+
+    def text(self) -> str:
+        """The coding in words."""
+        told = [f"{self.code_text(code)}={name}" for code, name in self.names.items()]
+        return " ".join(told + ([f"{_REST}={self.rest}"] if self.rest else []))
+
+    def code_text(self, code: int) -> str:
+        """A code as it is written."""
+        return f"#{code:06x}" if self.colours else str(code)
+
+
+DEFAULT_CODING = LabelCoding({0: UNLABELLED_NAME, 1: "sand", 2: "rock"})
+"""0 unlabelled, 1 sand, 2 rock."""
+
+
+def make_coding(pairs: Mapping[object, object], where: object) -> LabelCoding:
+    """A coding from what a user wrote: numbers, `#rrggbb`, or `*` for the rest; to class names.
+
+    Raises:
+        UsageError: a key that is no code, a value that is no name, numbers and colours mixed, or no code at all.
+    """
+    names: dict[int, str] = {}
+    rest, colours = None, set()
+    for key, value in pairs.items():
+        word, name = str(key).strip(), str(value).strip()
+        if not name or not isinstance(value, str | int):
+            raise UsageError(f"{word}={value} names no class", where=where, fix="write CODE=CLASS, such as 3=rock")
+        if word == _REST:
+            rest = name
+        elif re.fullmatch(r"#[0-9a-fA-F]{6}", word):
+            names[int(word[1:], 16)] = name
+            colours.add(True)
+        elif re.fullmatch(r"-?[0-9]{1,9}", word):
+            names[int(word)] = name
+            colours.add(False)
+        else:
+            raise UsageError(
+                f"{word[:40]!r} is no code", where=where, fix="write a number, a colour as #rrggbb, or * for the rest"
+            )
+    if len(colours) != 1:
+        what = "numbers and colours are mixed" if colours else "no code is named"
+        raise UsageError(what, where=where, fix="write CODE=CLASS for every code, such as 0=unlabelled 1=sand 2=rock")
+    return LabelCoding(names, colours.pop(), rest)
+
+
+def parse_coding(words: Sequence[str], where: object = "--remap") -> LabelCoding:
+    """A coding from words such as `3=rock`.
+
+    Raises:
+        UsageError: a word of another form, or what `make_coding` refuses.
+    """
+    pairs: dict[object, object] = {}
+    for word in words:
+        code, separator, name = word.rpartition("=")
+        if not separator:
+            raise UsageError(f"{word[:40]!r} is not CODE=CLASS", where=where, fix="write such as 3=rock 0=unlabelled")
+        pairs[code] = name
+    return make_coding(pairs, where)
+
+
+def read_coding(path: Path) -> LabelCoding:
+    """A coding from a YAML file of `CODE: CLASS`.
+
+    Raises:
+        UsageError: no such file, not YAML, or what `make_coding` refuses.
+    """
+    import yaml
+
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError("not YAML", where=path, fix="write lines such as 2: rock") from error
+    except OSError as error:
+        raise UsageError(f"cannot be read: {error.strerror}", where=path, fix="check --palette") from error
+    if not isinstance(tree, dict):
+        raise UsageError("holds no codes", where=path, fix="write lines such as 2: rock")
+    return make_coding(tree, path)
+
+
+def decode(
+    codes: Int[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], coding: LabelCoding, target: str, where: object
+) -> UInt8[np.ndarray, "H W"]:
+    """What each pixel is: `TARGET` where its class is `target`, `OTHER` of another class, else `UNLABELLED`.
+
+    Raises:
+        UsageError: the coding does not name the target.
+        JaxmapError: codes that the coding does not name; they are listed with their counts.
+    """
+    named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
+    if target not in named:
+        raise UsageError(
+            f"the ground truth knows no class {target!r}: {coding.text()}", where=where, fix="name its code: --remap"
+        )
+    meaning = {UNLABELLED_NAME: UNLABELLED, target: TARGET}
+    labels = np.full(codes.shape, UNLABELLED if coding.rest is None else meaning.get(coding.rest, OTHER), np.uint8)
+    known = np.full(codes.shape, coding.rest is not None)
+    for code, name in coding.names.items():
+        here = codes == code
+        labels[here] = meaning.get(name, OTHER)
+        known |= here
+    if (unknown := valid & ~known).any():
+        values, counts = np.unique(codes[unknown], return_counts=True)
+        pairs = list(zip(values.tolist(), counts.tolist(), strict=True))
+        told = ", ".join(f"{coding.code_text(value)} ({count} px)" for value, count in pairs[:_TOLD])
+        more = f" and {len(pairs) - _TOLD} more" if len(pairs) > _TOLD else ""
+        raise JaxmapError(
+            f"label values that mean nothing: {told}{more}; known are {coding.text()}",
+            where=where,
+            fix="name them all (--remap 0=unlabelled 1=sand 2=rock ...), or *=unlabelled for the rest",
+        )
+    return np.where(valid, labels, np.uint8(UNLABELLED))

@@ -1,0 +1,159 @@
+"""The part of a georeferenced raster that lies over a map, from any file format that GDAL knows."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Shaped
+
+from jaxmap.datasets.crs import Extent, crs_text, extent_in
+from jaxmap.errors import JaxmapError
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+    from rasterio.windows import Window
+
+_MAX_NUMBERS = 2**31
+_MARGIN_PX = 2
+
+Colours = dict[int, tuple[int, int, int]]
+
+
+class RasterWindow(NamedTuple):
+    """Pixels of a raster, and where they lie.
+
+    Attributes:
+        bands: the file's own numbers; a band of transparency is left out.
+        valid: pixels that are neither nodata nor transparent.
+        T_crs_pixel: affine, takes (column, row, 1) of this window to coordinates of `crs`; pixel `i` spans
+            `[i, i + 1)`.
+        crs: the system; None where neither the file nor the place says one.
+        palette: RGB of the values of a palette image, or None.
+        notes: what was assumed, in words.
+    """
+
+    bands: Shaped[np.ndarray, "B H W"]
+    valid: Bool[np.ndarray, "H W"]
+    T_crs_pixel: Float64[np.ndarray, "3 3"]
+    crs: str | None
+    palette: Colours | None
+    notes: tuple[str, ...]
+
+
+def read_window(path: Path, place: Extent, crs: str | None = None, margin: float = 0.0) -> RasterWindow:
+    """Reads the pixels of a raster that lie over a place.
+
+    Where the raster or the place is of an unknown system, it is taken for that of the other if the two overlap.
+
+    Args:
+        path: the file.
+        place: what is asked for.
+        crs: the raster's system, in place of what the file says.
+        margin: how much more is read on each side, in units of the place.
+
+    Raises:
+        JaxmapError: no such file, not a raster, without georeference, truncated, or elsewhere.
+    """
+    with _opened(path) as raster:
+        T_crs_pixel = np.array(raster.transform, np.float64).reshape(3, 3)
+        if np.array_equal(T_crs_pixel, np.eye(3)) or abs(np.linalg.det(T_crs_pixel)) == 0:
+            raise JaxmapError(
+                "the raster says not where it lies", where=path, fix="give a GeoTIFF, or a world file beside it"
+            )
+        own = crs or (raster.crs.to_wkt() if raster.crs else None)
+        covered = _covered(T_crs_pixel, raster.width, raster.height, own)
+        notes = _check_overlap(covered, place, path)
+        window = _window(raster, T_crs_pixel, extent_in(place.grown(margin), own, path))
+        bands, valid = _read(raster, window, path)
+        shift = np.array([[1.0, 0, window.col_off], [0, 1, window.row_off], [0, 0, 1]])
+        return RasterWindow(bands, valid, T_crs_pixel @ shift, own or place.crs, _palette(raster), notes)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[DatasetReader]:
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    if not path.is_file():
+        raise JaxmapError("no such file", where=path, fix="check the path of the raster")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        try:
+            with rasterio.open(path) as raster:
+                yield raster
+        except RasterioError as error:
+            raise JaxmapError(
+                "not a readable raster: damaged, cut off or no image", where=path, fix="give a whole GeoTIFF"
+            ) from error
+
+
+def _covered(T_crs_pixel: np.ndarray, width: int, height: int, crs: str | None) -> Extent:
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ T_crs_pixel.T
+    (west, south), (east, north) = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+    return Extent(float(west), float(south), float(east), float(north), crs)
+
+
+def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...]:
+    """What is assumed of unknown systems.
+
+    Raises:
+        JaxmapError: the two do not overlap.
+    """
+    there = extent_in(covered, place.crs, path)
+    if not there.overlaps(place):
+        unknown = {
+            (False, True): "; the raster has no CRS, say it with --truth-crs",
+            (True, False): "; the map has no CRS, map again with --crs",
+        }.get((covered.crs is not None, place.crs is not None), "; check that both are of one site")
+        raise JaxmapError(
+            f"the raster does not lie over the map: it reaches from {there.text()}, the map from {place.text()} "
+            f"({crs_text(place.crs or covered.crs)})",
+            where=path,
+            fix=unknown.removeprefix("; "),
+        )
+    if covered.crs is None and place.crs is not None:
+        return (f"{path.name} has no CRS: taken for the map's, {crs_text(place.crs)}",)
+    if covered.crs is not None and place.crs is None:
+        return (f"the map has no CRS: taken for that of {path.name}, {crs_text(covered.crs)}",)
+    return ()
+
+
+def _window(raster: DatasetReader, T_crs_pixel: np.ndarray, wanted: Extent) -> Window:
+    """The whole pixels that hold a box, with some to spare."""
+    from rasterio.windows import Window
+
+    west, south, east, north = wanted[:4]
+    corners = np.array([[west, south, 1], [east, south, 1], [west, north, 1], [east, north, 1]])
+    pixels = (corners @ np.linalg.inv(T_crs_pixel).T)[:, :2]
+    size = np.array([raster.width, raster.height])
+    first = np.clip(np.floor(pixels.min(axis=0)) - _MARGIN_PX, 0, size - 1).astype(int)
+    last = np.clip(np.ceil(pixels.max(axis=0)) + _MARGIN_PX, first + 1, size).astype(int)
+    return Window(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))  # type: ignore[call-arg]
+
+
+def _read(raster: DatasetReader, window: Window, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    from rasterio.enums import ColorInterp
+
+    bands = [index for index, kind in zip(raster.indexes, raster.colorinterp, strict=True) if kind != ColorInterp.alpha]
+    numbers = int(window.width) * int(window.height) * len(bands)
+    if numbers > _MAX_NUMBERS:
+        raise JaxmapError(
+            f"{numbers:.2g} numbers of the raster lie over the map", where=path, fix="give it at a coarser resolution"
+        )
+    values = raster.read(bands, window=window)
+    valid = raster.dataset_mask(window=window) > 0
+    if values.dtype.kind == "f":
+        valid &= np.isfinite(values).all(axis=0)
+    return values, valid
+
+
+def _palette(raster: DatasetReader) -> Colours | None:
+    try:
+        return {value: colour[:3] for value, colour in raster.colormap(1).items()}
+    except ValueError:
+        return None

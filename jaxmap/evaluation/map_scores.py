@@ -1,0 +1,101 @@
+"""Scores of cells against truth: confusion and what follows from it, and how well probabilities are calibrated."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+CALIBRATION_BINS = 15
+_LEAST_PROBABILITY = 1e-6
+"""Probabilities are kept this far from 0 and 1 in the likelihood: one certain mistake must not make it infinite."""
+
+
+class Confusion(NamedTuple):
+    """Cells by what they are called and what they are; positive is the class that is scored (rock)."""
+
+    tp: int
+    fp: int
+    fn: int
+    tn: int
+
+    @property
+    def total(self) -> int:
+        """All cells counted."""
+        return sum(self)
+
+
+def count_confusion(
+    called: Bool[np.ndarray, "*s"], truth: Bool[np.ndarray, "*s"], counted: Bool[np.ndarray, "*s"]
+) -> Confusion:
+    """Counts the cells where `counted` is true."""
+    called, truth = np.asarray(called)[counted], np.asarray(truth)[counted]
+    kinds = (called & truth, called & ~truth, ~called & truth, ~called & ~truth)
+    return Confusion(*(int(np.sum(kind)) for kind in kinds))
+
+
+def confusion_scores(confusion: Confusion) -> dict[str, float | None]:
+    """Accuracy, IoU, precision, recall and F1; None where a quotient has nothing below its line."""
+    tp, fp, fn, tn = confusion
+    return {
+        "accuracy": _quotient(tp + tn, confusion.total),
+        "iou": _quotient(tp, tp + fp + fn),
+        "precision": _quotient(tp, tp + fp),
+        "recall": _quotient(tp, tp + fn),
+        "f1": _quotient(2 * tp, 2 * tp + fp + fn),
+    }
+
+
+def probability_scores(
+    probability: Float[np.ndarray, "*s"], truth: Bool[np.ndarray, "*s"], counted: Bool[np.ndarray, "*s"]
+) -> dict[str, float | None]:
+    """Negative log-likelihood (nats per cell), Brier score and expected calibration error of probabilities.
+
+    `ece` is the mean distance between the probability of the class and how often it is true, over 15 equal bins of
+    probability, weighted by their cells (Naeini et al. 2015; for the class itself, not for the winning one).
+    """
+    p, y = np.asarray(probability, np.float64)[counted], np.asarray(truth)[counted]
+    if not p.size:
+        return {"nll": None, "brier": None, "ece": None}
+    safe = p.clip(_LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY)
+    place = np.minimum((p * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
+    said, true = (np.bincount(place, weight, minlength=CALIBRATION_BINS) for weight in (p, y))
+    return {
+        "nll": float(-np.where(y, np.log(safe), np.log1p(-safe)).mean()),
+        "brier": float(((p - y) ** 2).mean()),
+        "ece": float(np.abs(said - true).sum() / p.size),
+    }
+
+
+def score_cells(
+    called: Bool[np.ndarray, "*s"],
+    probability: Float[np.ndarray, "*s"],
+    truth: Bool[np.ndarray, "*s"],
+    counted: Bool[np.ndarray, "*s"],
+    observed: Bool[np.ndarray, "*s"] | None = None,
+) -> dict[str, Any]:
+    """All scores of cells, from arrays of one shape.
+
+    Args:
+        called: cells that the map calls by the class.
+        probability: of the class, for each cell.
+        truth: cells that are of the class.
+        counted: cells that count.
+        observed: cells that the map observed; `coverage` is their share of those that count (1 where not given).
+
+    Returns:
+        accuracy iou precision recall f1 coverage tp fp fn tn nll brier ece; None where a score is not defined.
+    """
+    confusion = count_confusion(called, truth, counted)
+    seen = confusion.total if observed is None else int((np.asarray(observed) & counted).sum())
+    return {
+        **confusion_scores(confusion),
+        "coverage": _quotient(seen, confusion.total),
+        **confusion._asdict(),
+        **probability_scores(probability, truth, counted),
+    }
+
+
+def _quotient(above: float, below: float) -> float | None:
+    return above / below if below else None

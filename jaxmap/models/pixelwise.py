@@ -1,0 +1,131 @@
+"""What a network says of every pixel of an image, without ever holding all class logits at its full size.
+
+An image passes through a network at the network's own size or at one that is given, and its logits come
+back to the pixels of the image: `segment` and the labeller of the compiled step both do so by this file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from jaxmap.errors import UsageError
+from jaxmap.models.architecture import Architecture
+from jaxmap.models.convolutions import PRECISION, resize_bilinear, resize_rows
+from jaxmap.models.deeplab import Images, padded_size
+
+Size = tuple[int, int]
+"""Height and width in pixels."""
+
+_BLOCK_ROWS = 16
+_BLOCK_COLUMNS = 128
+
+
+def check_size(size_px: Size | None, where: object) -> None:
+    """Refuses a size that no image can have.
+
+    Raises:
+        UsageError: the height or the width is below 1.
+    """
+    if size_px is not None and min(size_px) < 1:
+        raise UsageError(f"size {size_px[0]} {size_px[1]}", where=where, fix="give a height and a width above 0")
+
+
+def resized_input(images: Images, size_px: Size | None) -> UInt8[Array, "B h w 3"] | Float[Array, "B h w 3"]:
+    """The images at the size that the network runs at; their own where it is None."""
+    if size_px is None:
+        return images
+    return resize_bilinear(images.astype(jnp.float32), *size_px, align_corners=False)
+
+
+def resized_output(logits: Float[Array, "B h w C"], image_px: Sequence[int]) -> Float[Array, "B H W C"]:
+    """Logits at the size that the network runs at, brought to the pixels of the image."""
+    height, width = image_px
+    return resize_bilinear(logits, height, width, align_corners=False)
+
+
+class Upsampling(NamedTuple):
+    """From coarse logits straight to the pixels of an image: `rows @ logits @ columns.T` for each class."""
+
+    rows: Float[np.ndarray, "H h"]
+    columns: Float[np.ndarray, "W w"]
+
+
+def upsampling(
+    architecture: Architecture, coarse: Sequence[int], image_px: Sequence[int], size_px: Size | None
+) -> Upsampling:
+    """The network's own last upsampling, the cut of its padding, and `resized_output`, all in one.
+
+    Args:
+        architecture: the network.
+        coarse: height and width of its coarse logits.
+        image_px: those of the image.
+        size_px: those that the network runs at; the image's where None.
+    """
+
+    def along(axis: int) -> np.ndarray:
+        inside = image_px[axis] if size_px is None else size_px[axis]
+        padded = padded_size(inside, architecture)
+        matrix = resize_rows(np.eye(coarse[axis]), padded, align_corners=architecture.align_corners)[:inside]
+        return resize_rows(matrix, image_px[axis], align_corners=False).astype(np.float32)
+
+    return Upsampling(along(0), along(1))
+
+
+def map_pixels(
+    function: Callable[[Float[Array, "R C W"]], tuple[Array, ...]], coarse: Float[Array, "h w C"], places: Upsampling
+) -> tuple[Array, ...]:
+    """Applies a function to the logits at all pixels, a few rows at a time.
+
+    Args:
+        function: from the logits of R rows to images (R, W); it must treat pixels alike.
+        coarse: the coarse logits.
+        places: where the pixels lie among them.
+
+    Returns:
+        The images (H, W) that the function gives.
+    """
+    height, width = len(places.rows), len(places.columns)
+    rows, columns = _bands(places.rows, _BLOCK_ROWS), _bands(places.columns, _BLOCK_COLUMNS)
+    # Classes between rows and columns: softmax and maximum over them are fastest there.
+    coarse = jnp.swapaxes(coarse, 1, 2)
+
+    # On the way back the logits are computed anew, so that they are never all held there either.
+    @jax.checkpoint
+    def block(band: tuple[Int[Array, ""], Float[Array, "R near"]]) -> tuple[Array, ...]:
+        start, weights = band
+        near = jax.lax.dynamic_slice_in_dim(coarse, start, weights.shape[1])
+        lines = jnp.einsum("Rn,ncw->Rcw", weights, near, precision=PRECISION)
+        parts = [
+            jnp.dot(lines[..., first : first + columns.weights.shape[2]], weights.T, precision=PRECISION)
+            for first, weights in zip(columns.starts.tolist(), columns.weights, strict=True)
+        ]
+        logits = jnp.concatenate(parts, axis=-1)[..., :width]
+        # Without the barrier they would be computed anew for each use.
+        return function(jax.lax.optimization_barrier(logits))
+
+    images = jax.lax.map(block, (jnp.asarray(rows.starts), jnp.asarray(rows.weights)))
+    return tuple(image.reshape(-1, width)[:height] for image in images)
+
+
+class _Bands(NamedTuple):
+    """The rows of a matrix in bands, without most of the zeros: the column where each band starts, and its numbers."""
+
+    starts: Int[np.ndarray, "bands"]
+    weights: Float[np.ndarray, "bands size near"]
+
+
+def _bands(matrix: Float[np.ndarray, "pixels coarse"], size: int) -> _Bands:
+    """Cuts the matrix of an axis: neighbouring pixels depend on few coarse ones, and those are neighbours."""
+    missing = -len(matrix) % size
+    blocks = np.pad(matrix, ((0, missing), (0, 0))).reshape(-1, size, matrix.shape[1])
+    met = [np.flatnonzero(block.any(axis=0)) for block in blocks]
+    near = max(int(index[-1] - index[0]) + 1 for index in met)
+    starts = np.array([min(int(index[0]), matrix.shape[1] - near) for index in met], np.int32)
+    weights = [block[:, start : start + near] for start, block in zip(starts, blocks, strict=True)]
+    return _Bands(starts, np.stack(weights))

@@ -1,0 +1,239 @@
+"""The pickles inside PyTorch's files, interpreted without running anything that they ask for.
+
+A pickle is a program. Here only the few instructions that describe dicts of tensors are interpreted, by the
+stack machine below, and every function or class that is not a tensor's is refused by its name. Nothing is
+imported or called that the file asks for.
+
+A small program can name one value twice, that pair twice, and so on: what would walk through such a value
+(hashing it, printing it, copying it) never ends. So only text and numbers are keys, only names are called,
+and no list is copied that the file can name again.
+"""
+
+from __future__ import annotations
+
+import math
+import pickletools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+MAX_AXES = 16
+
+_STORAGES = {
+    "DoubleStorage": "f8",
+    "FloatStorage": "f4",
+    "HalfStorage": "f2",
+    "LongStorage": "i8",
+    "IntStorage": "i4",
+    "ShortStorage": "i2",
+    "CharStorage": "i1",
+    "ByteStorage": "u1",
+    "BoolStorage": "?",
+}
+_MARK = object()
+
+
+@dataclass(frozen=True)
+class _Global:
+    """A name that the file asks for."""
+
+    module: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.module}.{self.name}"
+
+
+@dataclass(frozen=True)
+class Storage:
+    """The numbers of one or more tensors, not read yet."""
+
+    key: str
+    dtype: str
+    count: int
+
+    @property
+    def bytes(self) -> int:
+        """How many it is said to take."""
+        return self.count * np.dtype(self.dtype).itemsize
+
+
+class Refused(Exception):
+    """The file holds what is no dict of tensors."""
+
+
+@dataclass(frozen=True)
+class StoredTensor:
+    """A view of a storage, as the file describes it."""
+
+    storage: Storage
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def check(self) -> int:
+        """The bytes it takes, once it is known to lie inside its storage."""
+        whole = (*self.shape, *self.strides, self.offset)
+        if not all(isinstance(value, int) and value >= 0 for value in whole) or len(self.shape) != len(self.strides):
+            raise Refused("a tensor of impossible shape")
+        count = math.prod(self.shape)
+        last = self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.strides, strict=True))
+        if count and (last >= self.storage.count or count > self.storage.count):
+            raise Refused(f"a tensor of shape {short(list(self.shape))} in a storage of fewer numbers")
+        return count * np.dtype(self.storage.dtype).itemsize
+
+
+def short(value: object) -> str:
+    """At most 80 characters of what the file says; only for text, numbers and lists of numbers."""
+    text = str(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."
+
+
+def _call(function: object, arguments: object) -> object:
+    """What the few functions do that a tensor's description needs."""
+    if not isinstance(function, _Global) or not isinstance(arguments, tuple):
+        raise Refused("the file asks to call what is no function")
+    name = str(function)
+    if name == "collections.OrderedDict" and not arguments:
+        return {}
+    if name == "torch._utils._rebuild_parameter" and arguments:
+        return arguments[0]
+    if name == "torch._utils._rebuild_tensor_v2" and len(arguments) >= 4:
+        storage, offset, shape, strides = arguments[:4]
+        if not isinstance(storage, Storage):
+            raise Refused("a tensor without a storage")
+        if not isinstance(shape, tuple) or not isinstance(strides, tuple) or len(shape) > MAX_AXES:
+            raise Refused("a tensor of impossible shape")
+        return StoredTensor(storage, offset, shape, strides)
+    raise Refused(f"the file asks to call {name} in another way than PyTorch does, which is refused")
+
+
+def _named(module: object, name: object) -> _Global:
+    if not isinstance(module, str) or not isinstance(name, str):
+        raise Refused("a name that is no text")
+    found = _Global(module, name)
+    known = ("collections.OrderedDict", "torch._utils._rebuild_parameter", "torch._utils._rebuild_tensor_v2")
+    if str(found) not in known and not (module == "torch" and name in _STORAGES):
+        raise Refused(f"the file asks for {short(found)}, which is refused")
+    return found
+
+
+def _storage(identity: object) -> Storage:
+    if not isinstance(identity, tuple) or len(identity) != 5 or identity[0] != "storage":
+        raise Refused("a reference that is no storage")
+    kind, key, count = identity[1], identity[2], identity[4]
+    if not isinstance(kind, _Global) or kind.name not in _STORAGES:
+        raise Refused("a reference that is no storage")
+    if not isinstance(key, str) or not isinstance(count, int) or count < 0:
+        raise Refused("a reference that is no storage")
+    return Storage(key, _STORAGES[kind.name], count)
+
+
+def interpret(program: bytes) -> object:
+    """Runs the description of a dict of tensors on a stack of plain values."""
+    stack: list[Any] = []
+    memo: dict[int, object] = {}
+    for opcode, argument, _ in pickletools.genops(program):
+        name = opcode.name
+        if name == "STOP":
+            return stack.pop()
+        if name in _IGNORED:
+            continue
+        if name in _PUSHED:
+            stack.append(argument)
+        elif name in _MADE:
+            stack.append(_MADE[name]())
+        elif name in ("BINPUT", "LONG_BINPUT", "PUT"):
+            memo[int(argument)] = stack[-1]  # type: ignore[arg-type]
+        elif name == "MEMOIZE":
+            memo[len(memo)] = stack[-1]
+        elif name in ("BINGET", "LONG_BINGET", "GET"):
+            stack.append(memo[int(argument)])  # type: ignore[arg-type]
+        elif name == "GLOBAL":
+            stack.append(_named(*str(argument).split(" ", 1)))
+        elif name in _STACK_STEPS:
+            _STACK_STEPS[name](stack)
+        else:
+            raise Refused(f"the file uses the pickle instruction {name}, which is refused")
+    raise Refused("a description without an end")
+
+
+def _since_mark(stack: list) -> list:
+    index = len(stack) - 1 - next(back for back, value in enumerate(reversed(stack)) if value is _MARK)
+    values = stack[index + 1 :]
+    del stack[index:]
+    return values
+
+
+def _set_items(stack: list, values: list) -> None:
+    if not all(isinstance(key, str | int | float) for key in values[::2]):
+        raise Refused("a dict whose keys are neither text nor numbers")
+    stack[-1].update(zip(values[::2], values[1::2], strict=True))
+
+
+def _set_item(stack: list) -> None:
+    value, key = stack.pop(), stack.pop()
+    _set_items(stack, [key, value])
+
+
+def _tuple(stack: list, count: int) -> None:
+    values = tuple(stack[len(stack) - count :])
+    del stack[len(stack) - count :]
+    stack.append(values)
+
+
+def _reduce(stack: list) -> None:
+    arguments, function = stack.pop(), stack.pop()
+    stack.append(_call(function, arguments))
+
+
+def _append(stack: list) -> None:
+    value = stack.pop()
+    stack[-1].append(value)
+
+
+def _append_all(stack: list) -> None:
+    values = _since_mark(stack)
+    stack[-1].extend(values)
+
+
+def _drop_state(stack: list) -> None:
+    # The state of an OrderedDict is PyTorch's version notes, which say nothing of the tensors.
+    stack.pop()
+
+
+def _stack_global(stack: list) -> None:
+    name, module = stack.pop(), stack.pop()
+    stack.append(_named(module, name))
+
+
+_IGNORED = {"PROTO", "FRAME"}
+_PUSHED = {
+    *("BINUNICODE", "SHORT_BINUNICODE", "UNICODE", "BINUNICODE8", "SHORT_BINSTRING", "BINSTRING"),
+    *("BININT", "BININT1", "BININT2", "INT", "LONG", "LONG1", "BINFLOAT", "FLOAT"),
+}
+_MADE: dict[str, Callable[[], object]] = {
+    "MARK": lambda: _MARK,
+    "EMPTY_DICT": dict,
+    "EMPTY_LIST": list,
+    "EMPTY_TUPLE": tuple,
+    "NONE": lambda: None,
+    "NEWTRUE": lambda: True,
+    "NEWFALSE": lambda: False,
+}
+_STACK_STEPS: dict[str, Callable[[list], None]] = {
+    "SETITEM": _set_item,
+    "SETITEMS": lambda stack: _set_items(stack, _since_mark(stack)),
+    "APPEND": _append,
+    "APPENDS": _append_all,
+    "TUPLE": lambda stack: stack.append(tuple(_since_mark(stack))),
+    "TUPLE1": lambda stack: _tuple(stack, 1),
+    "TUPLE2": lambda stack: _tuple(stack, 2),
+    "TUPLE3": lambda stack: _tuple(stack, 3),
+    "REDUCE": _reduce,
+    "BINPERSID": lambda stack: stack.append(_storage(stack.pop())),
+    "STACK_GLOBAL": _stack_global,
+    "BUILD": _drop_state,
+}

@@ -1,0 +1,1 @@
+"""Training of the networks: data, augmentation, losses, the compiled step and the loop around it."""

@@ -1,0 +1,181 @@
+"""Augmentation: scaled, mirrored crops of images and masks, and changes of light, in one compiled function.
+
+A crop is drawn as a `View`, which says for every pixel of the crop where in the image it lies. Colours are
+interpolated there; labels are those of the nearest pixel, so that no label comes out which was not there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+
+from jaxmap.labels import IGNORE
+from jaxmap.training.options import AugmentationOptions
+
+_LUMA = (0.299, 0.587, 0.114)
+
+
+class View(NamedTuple):
+    """Where a crop lies on its image.
+
+    Attributes:
+        scale: crop pixels for each image pixel.
+        offset_px: (row, column) of the crop's first pixel on the scaled image; negative where the crop
+            begins outside it.
+        mirrored: whether left and right are exchanged.
+    """
+
+    scale: Float[Array, ""]
+    offset_px: Int[Array, "2"]
+    mirrored: Bool[Array, ""]
+
+
+def draw_view(key: PRNGKeyArray, size_px: Int[Array, "2"], options: AugmentationOptions) -> View:
+    """A random crop of an image of `size_px` (height, width).
+
+    Where the scaled image is smaller than the crop, it lies somewhere within it.
+    """
+    scale_key, offset_key, mirror_key = jax.random.split(key, 3)
+    scale = jax.random.uniform(scale_key, minval=options.scale[0], maxval=options.scale[1])
+    spare_px = jnp.floor(size_px * scale).astype(jnp.int32) - jnp.array(options.crop_px)
+    low, high = jnp.minimum(spare_px, 0), jnp.maximum(spare_px, 0)
+    offset_px = jax.random.randint(offset_key, (2,), low, high + 1)
+    return View(scale, offset_px, jax.random.bernoulli(mirror_key) & options.mirror)
+
+
+def whole_view(size_px: Int[Array, "2"], crop_px: tuple[int, int]) -> View:
+    """The whole image, as large as it fits into the crop, in its middle."""
+    scale = (jnp.array(crop_px) / size_px).min()
+    spare_px = jnp.round(size_px * scale).astype(jnp.int32) - jnp.array(crop_px)
+    return View(scale, spare_px // 2, jnp.zeros((), bool))
+
+
+def cut(
+    view: View,
+    image: UInt8[Array, "H W 3"],
+    labels: UInt8[Array, "H W"],
+    size_px: Int[Array, "2"],
+    crop_px: tuple[int, int],
+    fill: tuple[float, ...],
+) -> tuple[Float[Array, "h w 3"], UInt8[Array, "h w"]]:
+    """Cuts a view out of an image and its labels.
+
+    Args:
+        view: what is cut.
+        image: RGB, 0 to 255; may be padded below and to the right.
+        labels: of the same pixels.
+        size_px: height and width of the image without the padding.
+        crop_px: height and width of the crop.
+        fill: colour of what lies outside the image; its label is `IGNORE`.
+
+    Returns:
+        The crop, 0 to 255, and its labels.
+    """
+    rows, columns = (_positions(view, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
+    inside = rows.inside[:, None] & columns.inside[None, :]
+    near = labels[rows.nearest][:, columns.nearest]
+    values = image.astype(jnp.float32)
+    values = _between(values[rows.low], values[rows.high], rows.share[:, None, None])
+    values = _between(values[:, columns.low], values[:, columns.high], columns.share[None, :, None])
+    return jnp.where(inside[..., None], values, jnp.array(fill)), jnp.where(inside, near, IGNORE).astype(jnp.uint8)
+
+
+class _Positions(NamedTuple):
+    """Where the rows (or columns) of a crop lie on its image."""
+
+    nearest: Array
+    low: Array
+    high: Array
+    share: Array
+    inside: Array
+
+
+def _positions(view: View, axis: int, size: Array, count: int) -> _Positions:
+    exact = (jnp.arange(count) + view.offset_px[axis] + 0.5) / view.scale - 0.5
+    if axis == 1:
+        exact = jnp.where(view.mirrored, size - 1 - exact, exact)
+    nearest = jnp.floor(exact + 0.5).astype(jnp.int32)
+    inside = (nearest >= 0) & (nearest < size)
+    exact = jnp.clip(exact, 0, size - 1)
+    low = jnp.floor(exact).astype(jnp.int32)
+    return _Positions(jnp.clip(nearest, 0, size - 1), low, jnp.minimum(low + 1, size - 1), exact - low, inside)
+
+
+def _between(before: Array, after: Array, share: Array) -> Array:
+    return before + (after - before) * share
+
+
+def change_light(
+    key: PRNGKeyArray, image: Float[Array, "h w 3"], options: AugmentationOptions
+) -> Float[Array, "h w 3"]:
+    """Brightness, contrast, saturation, gamma, hue and noise, each drawn within its option; 0 leaves it alone.
+
+    Changes that are off cost nothing: what is drawn depends on the options alone.
+    """
+    keys = jax.random.split(key, 6)
+
+    def factor(index: int, spread: float) -> Array:
+        return jnp.exp(jax.random.uniform(keys[index], minval=-1.0, maxval=1.0) * jnp.log1p(spread))
+
+    red, green, blue = (image[..., channel] for channel in range(3))
+    if options.hue_rad:
+        red, green, blue = _turned(jax.random.uniform(keys[0], minval=-1.0) * options.hue_rad, red, green, blue)
+    if options.saturation:
+        amount, grey = factor(1, options.saturation), _luma(red, green, blue)
+        red, green, blue = (_between(grey, channel, amount) for channel in (red, green, blue))
+    if options.contrast:
+        amount, level = factor(2, options.contrast), _luma(red, green, blue).mean()
+        red, green, blue = (_between(level, channel, amount) for channel in (red, green, blue))
+    if options.brightness:
+        amount = factor(3, options.brightness)
+        red, green, blue = (channel * amount for channel in (red, green, blue))
+    image = jnp.clip(jnp.stack([red, green, blue], axis=-1), 0, 255)
+    if options.gamma:
+        image = 255 * (image / 255) ** factor(4, options.gamma)
+    if options.noise:
+        image = jnp.clip(image + options.noise * jax.random.normal(keys[5], image.shape), 0, 255)
+    return image
+
+
+def _luma(red: Array, green: Array, blue: Array) -> Array:
+    return _LUMA[0] * red + _LUMA[1] * green + _LUMA[2] * blue
+
+
+def _turned(angle_rad: Array, red: Array, green: Array, blue: Array) -> tuple[Array, Array, Array]:
+    """Colours turned around the grey axis, which keeps greys as they are (Rodrigues' formula)."""
+    cosine, sine = jnp.cos(angle_rad), jnp.sin(angle_rad) / jnp.sqrt(3.0)
+    grey = (red + green + blue) * ((1 - cosine) / 3)
+    return (
+        red * cosine + (blue - green) * sine + grey,
+        green * cosine + (red - blue) * sine + grey,
+        blue * cosine + (green - red) * sine + grey,
+    )
+
+
+def augment(
+    key: PRNGKeyArray,
+    image: UInt8[Array, "H W 3"],
+    labels: UInt8[Array, "H W"],
+    size_px: Int[Array, "2"],
+    original: Bool[Array, ""],
+    options: AugmentationOptions,
+    fill: tuple[float, ...],
+) -> tuple[Float[Array, "h w 3"], UInt8[Array, "h w"]]:
+    """One training example out of one image: a random crop in random light, or the whole image where `original`."""
+    view_key, light_key = jax.random.split(key)
+    drawn = draw_view(view_key, size_px, options)
+    view = jax.tree.map(
+        lambda whole, part: jnp.where(original, whole, part), whole_view(size_px, options.crop_px), drawn
+    )
+    crop, near = cut(view, image, labels, size_px, options.crop_px, fill)
+    # Outside the image the colour stays the fill, whatever the light.
+    lit = jnp.where(_outside(view, size_px, options.crop_px)[..., None], crop, change_light(light_key, crop, options))
+    return jnp.where(original, crop, lit), near
+
+
+def _outside(view: View, size_px: Array, crop_px: tuple[int, int]) -> Array:
+    rows, columns = (_positions(view, axis, size_px[axis], crop_px[axis]).inside for axis in (0, 1))
+    return ~(rows[:, None] & columns[None, :])

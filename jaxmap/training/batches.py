@@ -1,0 +1,129 @@
+"""Which examples make which batch, and their pixels, read ahead in threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from jaxmap.labels import IGNORE
+from jaxmap.prefetch import prefetch
+from jaxmap.training.data import Example, read_example
+from jaxmap.training.masks import MaskLookup
+from jaxmap.training.options import TrainingOptions
+from jaxmap.training.step import Batch
+
+CACHE_BYTES = 2 * 2**30
+BATCHES_AHEAD = 3
+
+
+class Order(NamedTuple):
+    """The order in which a run sees its examples; any step can be asked for, so that a run can go on anywhere.
+
+    Epochs follow each other without a gap: a batch may end one and begin the next, and every example is
+    seen equally often.
+
+    Attributes:
+        images: how many there are.
+        variants: examples made of each: 1, or 1 + copies where they are fixed.
+        options: the recipe.
+    """
+
+    images: int
+    variants: int
+    options: TrainingOptions
+
+    @classmethod
+    def of(cls, images: int, options: TrainingOptions) -> Order:
+        """The order of a recipe over so many images."""
+        return cls(images, 1 + (options.augmentation.copies or 0), options)
+
+    @property
+    def examples(self) -> int:
+        """Examples in an epoch."""
+        return self.images * self.variants
+
+    @property
+    def steps(self) -> int:
+        """Steps of the whole run."""
+        return self.epoch_end(self.options.epochs - 1)
+
+    def epoch_end(self, epoch: int) -> int:
+        """The number of steps after which an epoch, counted from 0, is complete."""
+        return -(-(epoch + 1) * self.examples // self.options.batch_size)
+
+    def draws(self, step: int) -> Int[np.ndarray, "B 2"]:
+        """(epoch, example) of each place of a step's batch."""
+        size = self.options.batch_size
+        places = np.arange(step * size, (step + 1) * size)
+        epochs, within = np.divmod(places, self.examples)
+        orders = {epoch: self._permutation(epoch) for epoch in np.unique(epochs).tolist()}
+        chosen = [orders[epoch][place] for epoch, place in zip(epochs.tolist(), within.tolist(), strict=True)]
+        return np.stack([epochs, chosen], axis=1).astype(np.int32)
+
+    def _permutation(self, epoch: int) -> Int[np.ndarray, "N"]:
+        return np.random.default_rng((self.options.seed, epoch)).permutation(self.examples)
+
+
+class Pixels:
+    """Reads examples, and keeps as many as fit into memory."""
+
+    def __init__(self, examples: Sequence[Example], lookup: MaskLookup, cache_bytes: int = CACHE_BYTES) -> None:
+        self._examples, self._lookup = examples, lookup
+        self._kept: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._room, self._lock = cache_bytes, Lock()
+        self.height_px = max(example.size_px[0] for example in examples)
+        self.width_px = max(example.size_px[1] for example in examples)
+
+    def read(self, index: int) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
+        """An image and its labels.
+
+        Raises:
+            JaxmapError: they cannot be read.
+        """
+        kept = self._kept.get(index)
+        if kept is not None:
+            return kept
+        pair = read_example(self._examples[index], self._lookup)
+        taken = sum(array.nbytes for array in pair)
+        with self._lock:
+            if index not in self._kept and taken <= self._room:
+                self._kept[index], self._room = pair, self._room - taken
+        return pair
+
+    def batch(self, draws: Int[np.ndarray, "B 2"], order: Order) -> Batch:
+        """The batch of these draws.
+
+        Raises:
+            JaxmapError: an image cannot be read.
+        """
+        count = len(draws)
+        images = np.zeros((count, self.height_px, self.width_px, 3), np.uint8)
+        labels = np.full((count, self.height_px, self.width_px), IGNORE, np.uint8)
+        sizes = np.zeros((count, 2), np.int32)
+        for place, example in enumerate(draws[:, 1]):
+            image, mask = self.read(int(example) // order.variants)
+            sizes[place] = mask.shape
+            images[place, : mask.shape[0], : mask.shape[1]] = image
+            labels[place, : mask.shape[0], : mask.shape[1]] = mask
+        fixed = order.variants > 1
+        seeds = np.stack([np.zeros(count, np.int32) if fixed else draws[:, 0], draws[:, 1]], axis=1)
+        originals = (draws[:, 1] % order.variants == 0) & fixed
+        return Batch(images, labels, sizes, seeds, originals)  # type: ignore[arg-type]
+
+
+def batches_from(pixels: Pixels, order: Order, first_step: int) -> Iterator[Batch]:
+    """The batches of a run from a step on, read ahead.
+
+    Raises:
+        JaxmapError: an image cannot be read.
+    """
+    yield from prefetch(
+        lambda step: pixels.batch(order.draws(step), order),
+        range(first_step, order.steps),
+        workers=2,
+        ahead=BATCHES_AHEAD,
+    )

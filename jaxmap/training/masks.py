@@ -1,0 +1,238 @@
+"""What the pixels of a mask stand for: class indices, other values, or colours."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int32, UInt8
+from PIL import Image
+
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.labels import IGNORE
+from jaxmap.models.tensor_files import shortened
+
+IGNORED = "ignore"
+"""What a remap or a palette calls pixels that carry no class."""
+REST = "*"
+"""Stands for every value or colour that is not named."""
+UNNAMED = 254
+"""What `MaskLookup.table` holds for a code that stands for nothing."""
+
+_REMAP, _PALETTE = "--data.remap", "--data.palette"
+_VALUES, _COLOURS = 1 << 16, 1 << 24
+_LISTED = 8
+
+Kind = Literal["indices", "values", "colours"]
+Colour = tuple[int, int, int] | str
+
+
+class MaskLookup(NamedTuple):
+    """Turns the codes of a mask into labels.
+
+    Attributes:
+        classes: names in the order of the labels.
+        kind: whether a code is a class index, another value, or a colour (`0xRRGGBB`).
+        table: the label of every code; `UNNAMED` where it stands for nothing.
+    """
+
+    classes: tuple[str, ...]
+    kind: Kind
+    table: UInt8[np.ndarray, " N"]
+
+
+def make_mask_lookup(
+    classes: Sequence[str], remap: Mapping[int | str, str] | None, palette: Mapping[str, Colour] | None
+) -> MaskLookup:
+    """Says what the pixels of the masks stand for; without either, they are class indices and 255 for none.
+
+    Args:
+        classes: names in the order of the labels.
+        remap: class by value of the mask (0 to 65535), `"ignore"` for none; the key `"*"` is every other value.
+        palette: colour by class or `"ignore"`: (R, G, B) or `"#rrggbb"`, several of these with blanks
+            between them, or `"*"` for every other colour.
+
+    Raises:
+        UsageError: faulty classes, values or colours, something named twice, or a class that nothing stands for.
+    """
+    names = _checked_classes(classes)
+    if remap and palette:
+        raise UsageError("masks have either values or colours", where=_PALETTE, fix=f"leave out {_REMAP}")
+    if palette:
+        return MaskLookup(names, "colours", _colour_table(names, palette))
+    if remap:
+        return MaskLookup(names, "values", _value_table(names, remap))
+    indices = {**dict(enumerate(names)), IGNORE: IGNORED}
+    return MaskLookup(names, "indices", _table(_VALUES, names, indices, None, _REMAP))
+
+
+def read_codes(path: Path, lookup: MaskLookup) -> Int32[np.ndarray, "H W"]:
+    """The pixels of a mask as indices of `lookup.table`.
+
+    Values are taken as they are stored: those of a palette image are its indices, those of a bilevel
+    image 0 and 1, those of grey stored as RGB the grey level. Alpha is dropped. Colours are those seen.
+
+    Raises:
+        JaxmapError: the file is missing, broken, or of colours where values are asked for.
+    """
+    # A damaged file can raise nearly anything inside Pillow's decoders, so every exception is caught.
+    try:
+        with Image.open(path) as image:
+            image.load()
+            pixels = np.array(image.convert("RGB") if lookup.kind == "colours" else _without_alpha(image))
+    except FileNotFoundError as fault:
+        raise JaxmapError("the mask is missing", where=path, fix="restore the file") from fault
+    except Image.UnidentifiedImageError as fault:
+        raise JaxmapError("not an image of a known format", where=path, fix="replace the mask") from fault
+    except Exception as fault:
+        raise JaxmapError(f"the mask cannot be read ({fault})", where=path, fix="replace the file") from fault
+    if lookup.kind == "colours":
+        red, green, blue = (pixels[..., channel].astype(np.int32) for channel in range(3))
+        return (red << 16) | (green << 8) | blue
+    return _values(pixels, path)
+
+
+def read_labels(path: Path, lookup: MaskLookup) -> UInt8[np.ndarray, "H W"]:
+    """The labels of a mask: class indices, and 255 for none.
+
+    Raises:
+        JaxmapError: the mask cannot be read, or holds what stands for nothing.
+    """
+    codes = read_codes(path, lookup)
+    labels = lookup.table[codes]
+    unnamed = labels == UNNAMED
+    if unnamed.any():
+        raise unnamed_codes(lookup, np.unique(codes[unnamed]).tolist(), path)
+    return labels
+
+
+def unnamed_codes(lookup: MaskLookup, codes: Iterable[int], where: object) -> JaxmapError:
+    """The error for codes that stand for nothing."""
+    listed = shortened([code_text(lookup, code) for code in codes], _LISTED)
+    if lookup.kind == "colours":
+        what, fix = f"{_PALETTE} does not name the colours {listed}", f'name them, or give "{REST}" to one class'
+    elif lookup.kind == "values":
+        what, fix = f"{_REMAP} does not name the values {listed}", f'name them, or "{REST}" for the rest'
+    else:
+        last = len(lookup.classes) - 1
+        what = f"the values {listed} are no class (0 to {last}, and {IGNORE} for none)"
+        fix = f"give all --classes in order, or say what each value stands for: {_REMAP} VALUE CLASS ..."
+    return JaxmapError(what, where=where, fix=fix)
+
+
+def absent_classes(
+    lookup: MaskLookup, absent: Sequence[str], seen: Bool[np.ndarray, " N"], where: object
+) -> JaxmapError:
+    """The error for classes that no training mask holds.
+
+    Args:
+        lookup: what the pixels stand for.
+        absent: the classes.
+        seen: whether the training masks hold a code.
+        where: the folder.
+    """
+    codes = np.flatnonzero(seen).tolist()
+    held = shortened([f"{code_text(lookup, code)} ({meaning(lookup, code)})" for code in codes], _LISTED)
+    option = _PALETTE if lookup.kind == "colours" else _REMAP
+    fix = f"train on images that show {absent[0]}, leave it out of --classes, or correct {option}"
+    if lookup.kind == "indices" and len(absent) == 1 and seen[IGNORE]:
+        # Binary masks are often written as 0 and 255.
+        named = [f"{code} {absent[0] if code == IGNORE else meaning(lookup, code)}" for code in codes]
+        fix = f"if {IGNORE} stands for {absent[0]}, say so: {_REMAP} {' '.join(named)}"
+    what = f"no pixel of the training masks is {shortened(list(absent))}; they hold {held}"
+    return JaxmapError(what, where=where, fix=fix)
+
+
+def code_text(lookup: MaskLookup, code: int) -> str:
+    """A code as people write it: a number, or `#rrggbb`."""
+    return f"#{code:06x}" if lookup.kind == "colours" else str(code)
+
+
+def meaning(lookup: MaskLookup, code: int) -> str:
+    """The class that a code stands for, or `"ignore"`."""
+    label = int(lookup.table[code])
+    return IGNORED if label == IGNORE else lookup.classes[label]
+
+
+def _checked_classes(classes: Sequence[str]) -> tuple[str, ...]:
+    names = tuple(classes)
+    if not 1 <= len(names) <= UNNAMED or len(set(names)) != len(names) or not all(names):
+        fix = f"give 1 to {UNNAMED} different names"
+        raise UsageError(f"faulty classes {shortened(list(names), _LISTED) or '(none)'}", where="--classes", fix=fix)
+    if forbidden := {IGNORED, REST} & set(names):
+        raise UsageError(f"no class can be called {forbidden.pop()}", where="--classes", fix="name it otherwise")
+    return names
+
+
+def _value_table(classes: tuple[str, ...], remap: Mapping[int | str, str]) -> np.ndarray:
+    named: dict[int, str] = {}
+    for key, name in remap.items():
+        if str(key) == REST:
+            continue
+        text = str(key).strip()
+        if not re.fullmatch("[0-9]{1,5}", text) or int(text) >= _VALUES:
+            raise UsageError(
+                f"{key!r} is no value of a mask", where=_REMAP, fix=f'give 0 to {_VALUES - 1}, or "{REST}"'
+            )
+        if named.setdefault(int(text), name) != name:
+            raise UsageError(f"two classes for the value {text}", where=_REMAP, fix="name it once")
+    return _table(_VALUES, classes, named, remap.get(REST), _REMAP)
+
+
+def _colour_table(classes: tuple[str, ...], palette: Mapping[str, Colour]) -> np.ndarray:
+    named: dict[int, str] = {}
+    rest: str | None = None
+    for name, colours in palette.items():
+        for colour in colours.replace(",", " ").split() if isinstance(colours, str) else [colours]:
+            if colour == REST:
+                if rest is not None:
+                    raise UsageError(f'"{REST}" is given to {rest} and {name}', where=_PALETTE, fix="give it to one")
+                rest = name
+                continue
+            code = _colour_code(colour)
+            if (other := named.setdefault(code, name)) != name:
+                raise UsageError(f"{other} and {name} share #{code:06x}", where=_PALETTE, fix="a colour is one class's")
+    return _table(_COLOURS, classes, named, rest, _PALETTE)
+
+
+def _colour_code(colour: Colour) -> int:
+    if isinstance(colour, str) and re.fullmatch("#[0-9a-fA-F]{6}", colour):
+        return int(colour[1:], 16)
+    if not isinstance(colour, str) and len(colour) == 3 and all(value in range(256) for value in colour):
+        red, green, blue = map(int, colour)
+        return red << 16 | green << 8 | blue
+    raise UsageError(f"{colour!r} is no colour", where=_PALETTE, fix="give #rrggbb, or three numbers from 0 to 255")
+
+
+def _table(
+    length: int, classes: tuple[str, ...], named: Mapping[int, str], rest: str | None, where: str
+) -> UInt8[np.ndarray, " N"]:
+    label = {**{name: index for index, name in enumerate(classes)}, IGNORED: IGNORE}
+    given = {*named.values(), *([] if rest is None else [rest])}
+    if unknown := sorted(map(str, given - label.keys())):
+        fix = f"the classes are {', '.join(classes)}, and {IGNORED}"
+        raise UsageError(f"unknown class {shortened(unknown)}", where=where, fix=fix)
+    if missing := [name for name in classes if name not in given]:
+        raise UsageError(f"nothing stands for {shortened(missing)}", where=where, fix="name every class")
+    table = np.full(length, UNNAMED if rest is None else label[rest], np.uint8)
+    for code, name in named.items():
+        table[code] = label[name]
+    return table
+
+
+def _without_alpha(image: Image.Image) -> Image.Image:
+    return image.convert(image.mode[:-1]) if image.mode in ("LA", "PA", "RGBA") else image
+
+
+def _values(pixels: np.ndarray, path: Path) -> Int32[np.ndarray, "H W"]:
+    if pixels.ndim == 3 and pixels.shape[2] == 3 and pixels.dtype == np.uint8:
+        if (pixels != pixels[..., :1]).any():
+            fix = f"say which colour is which class: {_PALETTE} CLASS '#rrggbb' ..."
+            raise JaxmapError("the mask is in colour", where=path, fix=fix)
+        pixels = pixels[..., 0]
+    if pixels.ndim != 2 or pixels.dtype.kind not in "bui" or not 0 <= pixels.min() <= pixels.max() < _VALUES:
+        raise JaxmapError("the mask holds no values of 8 or 16 bits", where=path, fix="write it as 8-bit grey")
+    return pixels.astype(np.int32)

@@ -1,0 +1,151 @@
+"""The settings of training, as frozen records that hold their own limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal
+
+from annotated_types import Ge, Gt, Interval
+
+from jaxmap.models.architecture import Backbone
+
+_STRICT: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
+
+Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
+Share = Annotated[float, Interval(ge=0, lt=1)]
+Size = Annotated[int, Interval(ge=16, le=4096)]
+
+
+@dataclass(frozen=True)
+class AugmentationOptions:
+    """How training examples are made of images; the changes of light are off unless set."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    crop_px: tuple[Size, Size] = (384, 384)
+    """Height and width of an example."""
+    scale: tuple[Positive, Positive] = (0.75, 1.75)
+    """Least and greatest factor that images are resized by."""
+    mirror: bool = True
+    """Exchange left and right of every second example."""
+    copies: Annotated[int, Ge(0)] | None = None
+    """Fixed examples made of each image, beside the image itself; by default every example is drawn anew."""
+    brightness: NotNegative = 0.0
+    """Brightness is multiplied by up to 1 + this, or divided by it."""
+    contrast: NotNegative = 0.0
+    """The same for the distance from the mean level."""
+    saturation: NotNegative = 0.0
+    """The same for the distance from grey."""
+    gamma: NotNegative = 0.0
+    """The same for the exponent of the tone curve."""
+    hue_rad: NotNegative = 0.0
+    """Greatest turn of colours around the grey axis."""
+    noise: NotNegative = 0.0
+    """Standard deviation of added noise, on a scale of 0 to 255."""
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """What is made small."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    cross_entropy: NotNegative = 1.0
+    """Weight of the cross-entropy."""
+    soft_iou: NotNegative = 0.0
+    """Weight of one minus the soft intersection over union, mean over classes."""
+    lovasz: NotNegative = 0.0
+    """Weight of the Lovasz-Softmax loss."""
+    class_weights: Literal["equal", "balanced"] | tuple[Positive, ...] = "equal"
+    """Weight of each class in the cross-entropy; balanced: by one over the square root of its share of pixels."""
+    label_smoothing: Share = 0.0
+    """Share of the truth spread over all classes."""
+
+
+@dataclass(frozen=True)
+class OptimiserOptions:
+    """How the weights move."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    kind: Literal["adamw", "sgd"] = "adamw"
+    """AdamW, or stochastic gradient descent with momentum."""
+    learning_rate: Positive = 1e-3
+    """At the start of the poly schedule."""
+    power: NotNegative = 0.9
+    """Exponent of the poly schedule: rate * (1 - step / steps) ** power."""
+    warmup_steps: Annotated[int, Ge(0)] = 50
+    """Steps over which the rate rises from 0."""
+    weight_decay: NotNegative = 1e-4
+    """Of kernels; norms and biases are spared."""
+    momentum: Share = 0.9
+    """Of stochastic gradient descent."""
+    clip_norm: Positive | None = 5.0
+    """Gradients longer than this are shortened."""
+    backbone_rate: Annotated[float, Interval(ge=0, le=10)] = 1.0
+    """Factor on the learning rate of the backbone; 0 freezes it."""
+    average: Share = 0.0
+    """Decay of a running mean of the weights that is validated and saved in their place; less at the start; 0: none."""
+
+
+@dataclass(frozen=True)
+class NormOptions:
+    """Which batch norms learn from the batch; the others keep the statistics they came with."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    backbone: Literal["auto", "batch", "frozen"] = "auto"
+    """Of the backbone; auto: frozen where it was trained before."""
+    head: Literal["auto", "batch", "frozen"] = "auto"
+    """Of ASPP and decoder; auto: frozen where they were trained before."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Everything that decides what a training run comes out as, but its data and its network."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    epochs: Annotated[int, Gt(0)] = 60
+    """How often every example is seen."""
+    batch_size: Annotated[int, Gt(0)] = 8
+    """Examples in a step."""
+    validate_every: Annotated[int, Gt(0)] = 5
+    """Epochs between two validations; the last epoch is always validated."""
+    keep: Literal["best", "last"] = "best"
+    """The weights written: those with the best mean IoU in validation, or the last ones."""
+    seed: Annotated[int, Interval(ge=0, lt=2**31)] = 0
+    """Seed of all randomness."""
+    augmentation: AugmentationOptions = field(default_factory=AugmentationOptions)
+    loss: LossOptions = field(default_factory=LossOptions)
+    optimiser: OptimiserOptions = field(default_factory=OptimiserOptions)
+    norm: NormOptions = field(default_factory=NormOptions)
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """The network; what is left open is as in the file that training starts from, or as its family has it."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    backbone: Backbone | None = None
+    """What computes the features; mobilenet_v2 unless --init says otherwise."""
+    family: Literal["torch", "tf"] | None = None
+    """Details of the head: those of torch implementations, or of the original in TensorFlow."""
+    output_stride: Literal[16, 8] | None = None
+    """Input pixels for each feature."""
+    head_channels: Annotated[int, Interval(ge=1, le=4096)] | None = None
+    """Channels of ASPP and decoder."""
+    atrous_rates: tuple[Annotated[int, Interval(ge=1, le=1024)], ...] | None = None
+    """Dilations of the ASPP branches."""
+    decoder: bool | None = None
+    """Whether a low-level feature joins before the logits: DeepLabv3+, or DeepLabv3."""
+    decoder_convs: Annotated[int, Interval(ge=1, le=8)] | None = None
+    """Separable convolutions of the decoder."""
+    low_level_channels: Annotated[int, Interval(ge=1, le=4096)] | None = None
+    """Channels the low-level feature is reduced to."""
+    top_conv: bool | None = None
+    """Whether MobileNetV2 keeps its last convolution, to 1280 channels."""
+    dropout: Share | None = None
+    """Share of ASPP features dropped while training."""

@@ -1,0 +1,95 @@
+"""Validation: the network, as it is so far, on images it does not learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxmap.errors import JaxmapError
+from jaxmap.evaluation.segmentation_scores import SegmentationScores
+from jaxmap.labels import IGNORE
+from jaxmap.models.architecture import Architecture
+from jaxmap.models.deeplab import Weights, fold_batch_norm, pure_network
+from jaxmap.training.data import Example, read_example
+from jaxmap.training.masks import MaskLookup
+
+SHOWN = 6
+
+
+class Shown(NamedTuple):
+    """An image, what it shows, and what the network says of it."""
+
+    name: str
+    image: UInt8[np.ndarray, "H W 3"]
+    truth: UInt8[np.ndarray, "H W"]
+    prediction: UInt8[np.ndarray, "H W"]
+
+
+class Validation(NamedTuple):
+    """What came out of one validation.
+
+    Attributes:
+        summary: as `SegmentationScores.summary`.
+        loss: mean negative log-likelihood of the labelled pixels; None where there are none.
+        shown: some of the images, spread over all.
+    """
+
+    summary: dict
+    loss: float | None
+    shown: tuple[Shown, ...]
+
+
+class Validator:
+    """Scores weights on images at their own size; it compiles once for each size.
+
+    Args:
+        architecture: of the network.
+        examples: the images.
+        lookup: what the pixels of their masks stand for.
+    """
+
+    def __init__(self, architecture: Architecture, examples: Sequence[Example], lookup: MaskLookup) -> None:
+        self._architecture, self._examples, self._lookup = architecture, examples, lookup
+        # Two jitted functions: inside one, XLA would fold the batch norms anew for every image.
+        self._fold = jax.jit(lambda weights: fold_batch_norm(architecture, weights)[1])
+        self._run: object = None
+
+    def score(self, weights: Weights) -> Validation:
+        """Scores weights, running statistics included.
+
+        Raises:
+            JaxmapError: an image cannot be read any more, or the network's answer to it is not finite.
+        """
+        folded = self._fold(weights)
+        if self._run is None:
+            architecture, _ = fold_batch_norm(self._architecture, weights)
+            self._run = jax.jit(pure_network(architecture, folded).apply)
+        scores, losses, pixels, shown = SegmentationScores.empty(self._architecture.classes), 0.0, 0, []
+        places = set(np.linspace(0, len(self._examples) - 1, SHOWN).round().astype(int).tolist())
+        for place, example in enumerate(self._examples):
+            image, truth = read_example(example, self._lookup)
+            logits = np.asarray(self._run(folded, image[None])[0])  # type: ignore[operator]
+            if not np.isfinite(logits).all():
+                raise JaxmapError(
+                    "the network's answer to a validation image is not finite",
+                    where=example.image,
+                    fix="take a lower optimiser.learning-rate and start anew",
+                )
+            scores.add(truth, logits, example.mask)
+            summed, counted = _negative_log_likelihood(logits, truth)
+            losses, pixels = losses + summed, pixels + counted
+            if place in places:
+                shown.append(Shown(example.name, image, truth, logits.argmax(axis=-1).astype(np.uint8)))
+        return Validation(scores.summary(), losses / pixels if pixels else None, tuple(shown))
+
+
+def _negative_log_likelihood(logits: Float[np.ndarray, "H W C"], truth: UInt8[np.ndarray, "H W"]) -> tuple[float, int]:
+    """Its sum over the labelled pixels, and their number."""
+    known = truth != IGNORE
+    values = logits[known] - logits[known].max(axis=-1, keepdims=True)
+    true = np.take_along_axis(values, truth[known].astype(np.int64)[:, None], axis=1)[:, 0]
+    return float((np.log(np.exp(values).sum(axis=-1)) - true).sum()), int(known.sum())

@@ -1,0 +1,67 @@
+"""The settings of a training run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar
+
+from annotated_types import Interval
+from pydantic import BeforeValidator
+
+from jaxmap.settings import Settings
+from jaxmap.training.options import NetworkOptions, TrainingOptions
+
+_STRICT: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
+
+Value = Annotated[str, BeforeValidator(str)]
+"""A value of the masks as text: YAML reads a number, JSON and the command line text."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What the masks mean, and which images validate."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    remap: dict[Value, str] | None = None
+    """Class by value of the masks, such as 255 rock; "ignore" is no class, and the value * every other."""
+    palette: dict[str, str] | None = None
+    """Colour of the masks by class, such as rock #ff0000; several of a class with blanks between."""
+    validation_share: Annotated[float, Interval(ge=0, lt=1)] = 0.2
+    """Share of the images that validates where no val.txt or train.txt says."""
+
+
+@dataclass(frozen=True)
+class TrainConfig(TrainingOptions):
+    """Everything that decides what a training run comes out as."""
+
+    classes: tuple[str, ...] = ("background", "sand", "rock")
+    """The classes, in the order of the labels."""
+    data: DataConfig = field(default_factory=DataConfig)
+    network: NetworkOptions = field(default_factory=NetworkOptions)
+
+
+_SETTINGS = Settings(TrainConfig, "train", folder="train", given=("training_data", "init"))
+
+
+def load_train_config(name_or_path: str) -> TrainConfig:
+    """Reads a configuration: a YAML file, or the name of one in `configs/train`.
+
+    Raises:
+        UsageError: no such file, not YAML, an unknown key, or a value out of range.
+    """
+    return _SETTINGS.load(name_or_path)
+
+
+def check_train_config(tree: dict[str, Any], where: object = "the command line") -> TrainConfig:
+    """Builds a configuration from plain values, strictly.
+
+    Raises:
+        UsageError: names every unknown key and every value out of range.
+    """
+    return _SETTINGS.check(tree, where)
+
+
+def train_config_tree(config: TrainConfig) -> dict[str, Any]:
+    """A configuration as plain values, for YAML and JSON."""
+    return _SETTINGS.tree(config)

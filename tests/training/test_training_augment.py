@@ -1,0 +1,270 @@
+"""Augmentation against its slow twin, and the laws it keeps: masks stay exact, colours stay on their masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference_augment
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from jaxmap.labels import IGNORE
+from jaxmap.training.augment import View, augment, change_light, cut, draw_view, whole_view
+from jaxmap.training.options import AugmentationOptions
+
+STORED_PX = (20, 24)
+"""Images are padded to this, so that each function is compiled once for all sizes."""
+SIZES_PX = ((20, 24), (10, 24), (20, 9))
+CROP_PX = (16, 19)
+FILL = (12.0, 100.0, 240.0)
+OPTIONS = AugmentationOptions(crop_px=CROP_PX, scale=(0.4, 2.5))
+LIGHT = replace(OPTIONS, brightness=0.5, contrast=0.5, saturation=0.5, gamma=0.5, hue_rad=0.5, noise=9.0)
+
+fast_cut = jax.jit(partial(cut, crop_px=CROP_PX, fill=FILL))
+fast_draw = jax.jit(partial(draw_view, options=OPTIONS))
+fast_augment = jax.jit(partial(augment, options=OPTIONS, fill=FILL))
+lit_augment = jax.jit(jax.vmap(partial(augment, options=LIGHT, fill=FILL)))
+"""Of two examples at once."""
+
+sizes = st.tuples(st.integers(1, STORED_PX[0]), st.integers(1, STORED_PX[1]))
+scales = st.floats(0.25, 4.0, width=32)
+offsets = st.tuples(st.integers(-20, 40), st.integers(-20, 40))
+seeds = st.integers(0, 2**31 - 1)
+
+
+def view_of(scale: float, offset_px: tuple[int, int], mirrored: bool) -> View:
+    return View(jnp.float32(scale), jnp.array(offset_px, jnp.int32), jnp.array(mirrored))
+
+
+def example(size_px: tuple[int, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image and its labels, 0 to 4 and `IGNORE`; what pads them is told apart: white, of label 99."""
+    draw = np.random.default_rng(seed)
+    image = np.full((*STORED_PX, 3), 255, np.uint8)
+    labels = np.full(STORED_PX, 99, np.uint8)
+    image[: size_px[0], : size_px[1]] = draw.integers(0, 200, (*size_px, 3))
+    labels[: size_px[0], : size_px[1]] = draw.choice([0, 1, 2, 3, 4, IGNORE], size_px)
+    return image, labels
+
+
+def cut_of(view: View, image: np.ndarray, labels: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    return tuple(map(np.asarray, fast_cut(view, image, labels, np.array(size_px, np.int32))))
+
+
+def lit(*words: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Crops and labels of two examples of (seed, image, labels, size, original), in changed light."""
+    seeds, images, labels, sizes_px, originals = zip(*words, strict=True)
+    keys = jax.vmap(jax.random.key)(np.array(seeds))
+    arrays = map(np.array, (images, labels, np.array(sizes_px, np.int32), originals))
+    crops, near = lit_augment(keys, *arrays)
+    return np.asarray(crops), np.asarray(near)
+
+
+def coded(size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """An image in bands of flat colour that tell the label: red is 50 for each label."""
+    rows, columns = np.indices(STORED_PX)
+    labels = ((rows // 4 + columns // 5) % 4).astype(np.uint8)
+    labels[size_px[0] :], labels[:, size_px[1] :] = 99, 99
+    return np.stack([50 * labels, 0 * labels, 0 * labels], axis=-1).astype(np.uint8), labels
+
+
+@given(sizes, scales, offsets, st.booleans(), seeds)
+def test_a_cut_is_its_slow_twin(size_px, scale, offset_px, mirrored, seed):
+    image, labels = example(size_px, seed)
+    crop, near = cut_of(view_of(scale, offset_px, mirrored), image, labels, size_px)
+    colours, expected = reference_augment.cut(scale, offset_px, mirrored, image, labels, size_px, CROP_PX, FILL)
+    np.testing.assert_array_equal(near, expected)
+    np.testing.assert_allclose(crop, colours, atol=1e-3)
+
+
+@given(sizes, scales, offsets, st.booleans(), seeds)
+def test_no_label_comes_out_that_was_not_there(size_px, scale, offset_px, mirrored, seed):
+    image, labels = example(size_px, seed)
+    crop, near = cut_of(view_of(scale, offset_px, mirrored), image, labels, size_px)
+    assert set(np.unique(near)) <= {*np.unique(labels[: size_px[0], : size_px[1]]), IGNORE}
+    # Colours lie between those of the image: its padding, 255, shines through nowhere.
+    filled = (crop == np.array(FILL, np.float32)).all(axis=-1)
+    assert (near[filled & (near != IGNORE)] <= 4).all()
+    assert crop[~filled].max(initial=0) < 200
+
+
+@given(sizes, scales, offsets, st.booleans())
+def test_what_lies_outside_is_fill_and_carries_no_label(size_px, scale, offset_px, mirrored):
+    image, labels = np.zeros((*STORED_PX, 3), np.uint8), np.ones(STORED_PX, np.uint8)
+    crop, near = cut_of(view_of(scale, offset_px, mirrored), image, labels, size_px)
+    outside = near == IGNORE
+    assert (near[~outside] == 1).all()
+    np.testing.assert_array_equal(crop[outside], np.broadcast_to(np.array(FILL, np.float32), crop[outside].shape))
+    assert (crop[~outside] == 0).all()
+
+
+@given(seeds, st.booleans())
+def test_ignored_pixels_stay_ignored(seed, mirrored):
+    image, labels = example(STORED_PX, seed)
+    _, near = cut_of(view_of(2.0, (3, 5), mirrored), image, labels, STORED_PX)
+    _, marked = cut_of(view_of(2.0, (3, 5), mirrored), image, (labels == IGNORE).astype(np.uint8), STORED_PX)
+    np.testing.assert_array_equal(near == IGNORE, marked == 1)
+
+
+@given(st.tuples(st.integers(0, 4), st.integers(0, 5)), seeds)
+def test_the_view_that_changes_nothing_gives_the_very_crop(offset_px, seed):
+    image, labels = example(STORED_PX, seed)
+    crop, near = cut_of(view_of(1.0, offset_px, False), image, labels, STORED_PX)
+    rows, columns = (slice(start, start + count) for start, count in zip(offset_px, CROP_PX, strict=True))
+    np.testing.assert_array_equal(crop, image[rows, columns])
+    np.testing.assert_array_equal(near, labels[rows, columns])
+
+
+@given(scales, offsets, seeds)
+def test_mirroring_the_image_and_the_view_is_no_change(scale, offset_px, seed):
+    image, labels = example(STORED_PX, seed)
+    plain = cut_of(view_of(scale, offset_px, False), image, labels, STORED_PX)
+    again = cut_of(view_of(scale, offset_px, True), image[:, ::-1], labels[:, ::-1], STORED_PX)
+    np.testing.assert_allclose(again[0], plain[0], atol=0.02)
+    # Halfway between two pixels, "nearest" rounds to the right one on either side of the mirror.
+    assert (again[1] != plain[1]).mean() <= (0.5 if scale in (0.5, 2.0, 4.0) else 0.1)
+
+
+@given(seeds)
+def test_mirroring_twice_is_no_change(seed):
+    image, labels = example(CROP_PX, seed)
+    once = cut_of(view_of(1.0, (0, 0), True), image, labels, CROP_PX)
+    np.testing.assert_array_equal(once[1], labels[: CROP_PX[0], : CROP_PX[1]][:, ::-1])
+    padded, padded_labels = np.zeros_like(image), np.zeros_like(labels)
+    padded[: CROP_PX[0], : CROP_PX[1]], padded_labels[: CROP_PX[0], : CROP_PX[1]] = once
+    twice = cut_of(view_of(1.0, (0, 0), True), padded, padded_labels, CROP_PX)
+    np.testing.assert_array_equal(twice[0], image[: CROP_PX[0], : CROP_PX[1]])
+    np.testing.assert_array_equal(twice[1], labels[: CROP_PX[0], : CROP_PX[1]])
+
+
+@given(sizes, scales, offsets, st.booleans())
+def test_colours_stay_on_their_labels(size_px, scale, offset_px, mirrored):
+    image, labels = coded(size_px)
+    crop, near = cut_of(view_of(scale, offset_px, mirrored), image, labels, size_px)
+    seen = near != IGNORE
+    # Within half a step of the colour's own label, or on the border of two bands.
+    low, high = crop[seen][:, 0] // 50, -(-crop[seen][:, 0] // 50)
+    flat = np.isclose(crop[seen][:, 0] % 50, 0, atol=1e-3)
+    np.testing.assert_array_equal(np.rint(crop[seen][:, 0][flat] / 50), near[seen][flat])
+    assert ((near[seen] >= low - 3) & (near[seen] <= high + 3)).all()
+
+
+@given(sizes, st.tuples(st.integers(1, 40), st.integers(1, 40)))
+def test_the_whole_view_shows_the_whole_image_in_the_middle(size_px, crop_px):
+    view = whole_view(np.array(size_px), crop_px)
+    assume(min(size_px) * float(view.scale) >= 1)
+    lying = [
+        np.array([reference_augment.position(i, int(view.offset_px[axis]), float(view.scale), size_px[axis], False)
+                  for i in range(crop_px[axis])])
+        for axis in (0, 1)
+    ]  # fmt: skip
+    fits = []
+    for places, size in zip(lying, size_px, strict=True):
+        inside = (np.floor(places + 0.5) >= 0) & (np.floor(places + 0.5) < size)
+        step = 1 / float(view.scale)
+        assert inside.any()
+        assert places[inside][0] <= step and places[inside][-1] >= size - 1 - step, "from the first to the last pixel"
+        before, after = np.argmax(inside), np.argmax(inside[::-1])
+        assert abs(before - after) <= 1, "in the middle"
+        fits.append(before + after <= 1)
+    assert any(fits), "as large as it goes"
+    assert not bool(view.mirrored)
+
+
+@given(sizes, seeds)
+def test_a_drawn_view_lies_on_its_image_or_the_image_in_it(size_px, seed):
+    view = fast_draw(jax.random.key(seed), jnp.array(size_px))
+    assert OPTIONS.scale[0] <= float(view.scale) < OPTIONS.scale[1]
+    for offset, size, count in zip(view.offset_px.tolist(), size_px, CROP_PX, strict=True):
+        scaled = int(np.floor(np.float32(size) * np.float32(view.scale)))
+        assert min(scaled - count, 0) <= offset <= max(scaled - count, 0)
+
+
+def test_draws_reach_all_that_they_may():
+    fixed = replace(OPTIONS, scale=(1.0, 1.0))
+
+    @jax.jit
+    @jax.vmap
+    def draw(key: jax.Array) -> tuple[View, View]:
+        size_px = jnp.array([24, 30])
+        return draw_view(key, size_px, fixed), draw_view(key, size_px, replace(OPTIONS, mirror=False))
+
+    views, never = draw(jax.random.split(jax.random.key(0), 400))
+    assert set(views.offset_px[:, 0].tolist()) == set(range(24 - CROP_PX[0] + 1))
+    assert set(views.offset_px[:, 1].tolist()) == set(range(30 - CROP_PX[1] + 1))
+    assert 0.4 < views.mirrored.mean() < 0.6
+    assert not never.mirrored.any()
+    assert never.scale.min() < 0.5 and never.scale.max() > 2.4
+
+
+def test_the_same_key_is_the_same_example_whatever_stands_beside_it():
+    words = [(seed, *example(size_px, seed), size_px, False) for seed, size_px in enumerate(SIZES_PX)]
+    for one in words:
+        alone = lit(one, one)
+        np.testing.assert_array_equal(alone[0][0], alone[0][1])
+        for other in words:
+            together = lit(one, other)
+            np.testing.assert_array_equal(together[0][0], alone[0][0])
+            np.testing.assert_array_equal(together[1][0], alone[1][0])
+    anew = lit(words[0], (9, *words[0][1:]))
+    assert not np.array_equal(anew[0][0], anew[0][1])
+
+
+@given(sizes, seeds)
+def test_light_leaves_labels_and_fill_alone(size_px, seed):
+    image, labels = example(size_px, seed)
+    plain, near = fast_augment(jax.random.key(seed), image, labels, np.array(size_px, np.int32), np.array(False))
+    (crop, _), (labels, _) = lit(*[(seed, image, labels, size_px, False)] * 2)
+    np.testing.assert_array_equal(near, labels)
+    filled = (np.asarray(plain) == np.array(FILL, np.float32)).all(axis=-1)
+    np.testing.assert_array_equal(crop[filled], np.asarray(plain)[filled])
+    assert crop.min() >= 0 and crop.max() <= 255
+
+
+def test_an_original_is_the_image_itself_in_its_own_light():
+    image, labels = example(CROP_PX, 3)
+    words = (3, image, labels, CROP_PX)
+    (crop, drawn), (near, _) = lit((*words, True), (*words, False))
+    np.testing.assert_array_equal(crop, image[: CROP_PX[0], : CROP_PX[1]])
+    np.testing.assert_array_equal(near, labels[: CROP_PX[0], : CROP_PX[1]])
+    assert not np.array_equal(drawn, crop)
+
+
+CHANGES = ("brightness", "contrast", "saturation", "gamma", "hue_rad", "noise")
+COLOURS = np.random.default_rng(0).uniform(0, 255, (6, 7, 3)).astype(np.float32)
+
+
+def test_light_that_is_off_changes_nothing():
+    np.testing.assert_array_equal(change_light(jax.random.key(0), COLOURS, AugmentationOptions()), COLOURS)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_small_change_of_light_is_a_small_change_of_colours(change):
+    lit = change_light(jax.random.key(1), COLOURS, replace(AugmentationOptions(), **{change: 1e-3}))
+    assert 0 < np.abs(lit - COLOURS).max() < 1
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_black_and_white_and_grey_stay_in_range(change):
+    greys = np.repeat(np.linspace(0, 255, 12, dtype=np.float32)[:, None, None], 3, axis=-1)
+    lit = np.asarray(change_light(jax.random.key(2), greys, replace(AugmentationOptions(), **{change: 2.0})))
+    assert np.isfinite(lit).all() and lit.min() >= 0 and lit.max() <= 255
+    if change in ("hue_rad", "saturation"):
+        np.testing.assert_allclose(lit, greys, atol=1e-2)
+
+
+def test_brightness_and_contrast_by_hand():
+    only = AugmentationOptions(brightness=0.3)
+    dim = 80 + COLOURS / 4
+    factor = np.asarray(change_light(jax.random.key(4), dim, only)) / dim
+    np.testing.assert_allclose(factor, factor.flat[0], rtol=1e-5)
+    assert 1 / 1.3 <= factor.flat[0] <= 1.3
+    luma = dim @ np.array([0.299, 0.587, 0.114], np.float32)
+    lit = np.asarray(change_light(jax.random.key(5), dim, AugmentationOptions(contrast=0.1)))
+    factor = (lit - luma.mean()) / (dim - luma.mean())
+    np.testing.assert_allclose(factor, np.median(factor), rtol=1e-2)
+    assert 1 / 1.1 <= np.median(factor) <= 1.1
