@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from jaxmap import __version__
 from jaxmap.commands import COMMANDS
 from jaxmap.errors import JaxmapError
-from jaxmap.host_memory import restart_with_large_pages
+from jaxmap.host_memory import restart_with_lasting_memory
 
-LARGE_PAGES = ("train",)
+LASTING_MEMORY = ("train",)
 """Commands that take and give back gigabytes at every step."""
 
 
@@ -34,8 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] not in COMMANDS:
         _say(f"error: there is no command {words[0]!r}; choose one of {', '.join(COMMANDS)}")
         return 2
-    if arguments is None and words[0] in LARGE_PAGES:
-        restart_with_large_pages()
+    if arguments is None and words[0] in LASTING_MEMORY:
+        restart_with_lasting_memory()
     try:
         command = importlib.import_module(f"jaxmap.commands.{words[0]}")
         return command.main(words[1:]) or 0

@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 from jaxmap.cli import main as jaxmap
+from jaxmap.host_memory import restart_with_lasting_memory
 
 RUNS = {
     "pretrained": [],
@@ -31,6 +32,7 @@ def main() -> None:
     parser.add_argument("--only", choices=list(RUNS))
     arguments = parser.parse_args()
 
+    restart_with_lasting_memory()
     arguments.out.mkdir(parents=True, exist_ok=True)
     model = arguments.out / "backbone.safetensors"
     run("weights", "import", str(arguments.backbone), "--out", str(model))

@@ -18,12 +18,15 @@ NETWORK_MODULES = tuple(
 CHECKED_MODULES = (
     *FUSION_MODULES,
     *NETWORK_MODULES,
+    "deeplab_labeller",
+    "evaluation.pose_scores",
     "evaluation.segmentation_scores",
     "geometry",
-    "deeplab_labeller",
     "labellers",
     "labels",
+    "localisation",
     "mapper",
+    "simulation",
     "stereo",
 )
 # A float annotation takes an int, as PEP 484 has it.

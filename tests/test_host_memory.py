@@ -1,4 +1,4 @@
-"""Large pages are asked for once, where they help, and the command line stays what it was."""
+"""Lasting memory is asked for once, where the C library knows how, and the command line stays what it was."""
 
 from __future__ import annotations
 
@@ -11,12 +11,23 @@ import pytest
 
 from jaxmap import host_memory
 
+ASKED = f"glibc.malloc.hugetlb=1:glibc.malloc.mmap_max=0:glibc.malloc.trim_threshold={1 << 62}:glibc.malloc.arena_max=1"
 SCRIPT = """
 import os, sys
 from jaxmap import host_memory
-host_memory._would_help = lambda: True
 print(os.getpid(), sys.argv[1:], os.environ.get("GLIBC_TUNABLES", "unset"), flush=True)
-host_memory.restart_with_large_pages()
+host_memory.restart_with_lasting_memory()
+"""
+WORK = """
+import resource
+from jaxmap import host_memory
+host_memory.restart_with_lasting_memory()
+import numpy as np
+faults = []
+for _ in range(6):
+    np.ones(40_000_000, np.uint8)
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+print(faults[-1] - faults[1])
 """
 
 
@@ -26,58 +37,49 @@ def restarts(monkeypatch):
     made = []
     monkeypatch.setattr(os, "execve", lambda *arguments: made.append(arguments))
     monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    monkeypatch.setattr(platform, "libc_ver", lambda: ("glibc", "2.36"))
     return made
 
 
-def granting(monkeypatch, tmp_path, text, library=("glibc", "2.36")):
-    (tmp_path / "enabled").write_text(text)
-    monkeypatch.setattr(host_memory, "_SYSTEM", tmp_path / "enabled")
-    monkeypatch.setattr(platform, "libc_ver", lambda: library)
+def run(script: str, *words: str) -> str:
+    environment = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
+    return subprocess.run(
+        [sys.executable, "-c", script, *words], env=environment, capture_output=True, text=True, check=True
+    ).stdout
 
 
-def test_the_process_starts_again_with_the_setting_added(monkeypatch, tmp_path, restarts):
-    granting(monkeypatch, tmp_path, "always [madvise] never\n")
+def test_the_process_starts_again_with_the_settings_added(monkeypatch, restarts):
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.check=1")
-    host_memory.restart_with_large_pages()
+    host_memory.restart_with_lasting_memory()
     [(program, words, environment)] = restarts
     assert (program, words[1:]) == (sys.executable, sys.orig_argv[1:])
-    assert environment["GLIBC_TUNABLES"] == "glibc.malloc.check=1:glibc.malloc.hugetlb=1"
+    assert environment["GLIBC_TUNABLES"] == f"glibc.malloc.check=1:{ASKED}"
 
 
-@pytest.mark.parametrize("text", ["[always] madvise never\n", "always madvise [never]\n", ""])
-def test_nothing_happens_where_the_system_decides(monkeypatch, tmp_path, restarts, text):
-    granting(monkeypatch, tmp_path, text)
-    host_memory.restart_with_large_pages()
+@pytest.mark.parametrize("library", [("", ""), ("glibc", "2.25"), ("glibc", "odd"), ("musl", "1.2")])
+def test_nothing_happens_with_another_library(monkeypatch, restarts, library):
+    monkeypatch.setattr(platform, "libc_ver", lambda: library)
+    host_memory.restart_with_lasting_memory()
     assert not restarts
 
 
-@pytest.mark.parametrize("library", [("", ""), ("glibc", "2.34"), ("glibc", "odd"), ("musl", "1.2")])
-def test_nothing_happens_with_another_library(monkeypatch, tmp_path, restarts, library):
-    granting(monkeypatch, tmp_path, "always [madvise] never\n", library)
-    host_memory.restart_with_large_pages()
+@pytest.mark.parametrize("setting", ["glibc.malloc.hugetlb=0", "glibc.malloc.arena_max=4"])
+def test_what_the_user_has_set_stays(monkeypatch, restarts, setting):
+    monkeypatch.setenv("GLIBC_TUNABLES", setting)
+    host_memory.restart_with_lasting_memory()
     assert not restarts
 
 
-def test_nothing_happens_where_the_system_says_nothing(monkeypatch, tmp_path, restarts):
-    granting(monkeypatch, tmp_path, "")
-    monkeypatch.setattr(host_memory, "_SYSTEM", tmp_path / "absent")
-    host_memory.restart_with_large_pages()
-    assert not restarts
+glibc_only = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="these are settings of glibc's")
 
 
-def test_what_the_user_has_set_stays(monkeypatch, tmp_path, restarts):
-    granting(monkeypatch, tmp_path, "always [madvise] never\n")
-    monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.hugetlb=0")
-    host_memory.restart_with_large_pages()
-    assert not restarts
-
-
-@pytest.mark.skipif(os.name == "nt", reason="the process is replaced in place only on POSIX systems")
+@glibc_only
 def test_a_process_restarts_once_and_keeps_number_and_arguments():
-    environment = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
-    run = subprocess.run(
-        [sys.executable, "-c", SCRIPT, "train", "a b", "--out"], env=environment, capture_output=True, text=True
-    )
-    before, after = run.stdout.splitlines()
-    assert after == before.replace("unset", "glibc.malloc.hugetlb=1")
-    assert run.returncode == 0
+    before, after = run(SCRIPT, "train", "a b", "--out").splitlines()
+    assert after == before.replace("unset", ASKED)
+
+
+@glibc_only
+def test_memory_that_was_freed_is_not_fetched_again():
+    # Fetched anew, each of the four arrays would take 20 pages of 2 MiB or 10,000 of 4 KiB.
+    assert int(run(WORK)) < 20

@@ -8,6 +8,7 @@ COMMANDS: dict[str, str] = {
     "train": "train or fine-tune DeepLabv3+ on images and masks",
     "evaluate": "score a map against an orthomosaic labelled from above",
     "segment": "label images with a network, and score the labels",
+    "simulate": "render a traverse, or training images, of a simulated world",
     "weights": "convert or download pretrained networks",
     "export": "write a map in another form",
     "report": "write the HTML report of a run anew",

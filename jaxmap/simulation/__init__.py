@@ -1,0 +1,1 @@
+"""A simulator of rover traverses: worlds drawn from a seed, path-traced, written in the Katwijk layout."""

@@ -1,0 +1,179 @@
+"""Images to train a network on: single views, each of a world of its own, with their masks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxmap.labels import IGNORE
+from jaxmap.simulation.camera_rig import loccam, undistorted_pixels
+from jaxmap.simulation.develop import corner_distance, develop
+from jaxmap.simulation.draw import Draw, draw_world
+from jaxmap.simulation.drive import Drive, make_path
+from jaxmap.simulation.lighting import make_lighting
+from jaxmap.simulation.materials import make_textures
+from jaxmap.simulation.mesh import ROCK, Mesh
+from jaxmap.simulation.orthomosaic import surface_labels
+from jaxmap.simulation.rays import camera_rays
+from jaxmap.simulation.recipe import SceneKind
+from jaxmap.simulation.render import FirstHits, Renderer
+from jaxmap.simulation.rover import rover_mesh
+from jaxmap.simulation.terrain import Ground, fan
+from jaxmap.simulation.traverse import sand_exposure
+from jaxmap.simulation.world import WHEEL_FEEL_M, Points, bare_ground, build_world
+from jaxmap.simulation.writer import claim_folder, is_whole_image, write_png, write_record, write_text
+
+_VALIDATION_SHARE = 0.1
+_LENGTH_M = 1.0
+
+LEAST_ROCK_PX = 10
+"""Rocks of fewer pixels are no lesson: nobody would label them by hand."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """What decides a training set.
+
+    Attributes:
+        seed: of all that is drawn; the worlds of one seed are not those of another, nor of a traverse.
+        scene: few, small, medium or random.
+        images: how many.
+        height_px: of the images.
+        width_px: of the images.
+        samples: rays per pixel.
+    """
+
+    seed: int = 0
+    scene: SceneKind = "random"
+    images: int = 100
+    height_px: int = 384
+    width_px: int = 512
+    samples: int = 4
+
+
+@dataclass(frozen=True)
+class View:
+    """How the camera of one image looks: its height, how it is turned, its focal length and the shadow in view."""
+
+    height_m: float
+    pitch_deg: float
+    roll_deg: float
+    zoom: float
+    rover: bool
+
+
+def draw_view(seed: int) -> View:
+    """The view of a world's seed: about LocCam's, and well around it."""
+    draw = Draw(seed, "view")
+    return View(
+        height_m=draw.ratio(0.7, 1.7),
+        pitch_deg=draw.uniform(8, 32),
+        roll_deg=float(draw.rng.normal(0, 2.5)),
+        zoom=draw.ratio(0.85, 1.6),
+        rover=draw.chance(0.5),
+    )
+
+
+def world_seed(seed: int, index: int) -> int:
+    """The seed of the world of one image."""
+    return int(np.random.SeedSequence([seed, index, 0x714A]).generate_state(1)[0] >> 1)
+
+
+def simulate_training_set(out: Path, options: TrainingOptions, advance: Callable[[int], None]) -> float:
+    """Writes `images/`, `masks/`, `train.txt` and `val.txt`; images that are there and whole are kept.
+
+    Returns:
+        Seconds per image; 0 where none was left to render.
+
+    Raises:
+        JaxmapError: Mitsuba is missing, the folder holds something else, or a file cannot be written.
+    """
+    claim_folder(out, {"options": asdict(options)})
+    names = [f"{options.seed:04d}_{index:05d}" for index in range(options.images)]
+    seconds = []
+    for index, name in enumerate(names):
+        image, mask = out / "images" / f"{name}.png", out / "masks" / f"{name}.png"
+        if not all(is_whole_image(path, options.width_px, options.height_px) for path in (image, mask)):
+            started_s = time.monotonic()
+            pixels, labels, record = render_view(world_seed(options.seed, index), options)
+            write_png(image, pixels)
+            write_record(out / "worlds" / f"{name}.json", record)
+            write_png(mask, labels)
+            seconds.append(time.monotonic() - started_s)
+        advance(index + 1)
+    order = np.random.default_rng([options.seed, 0x5917]).permutation(options.images)
+    count = max(round(_VALIDATION_SHARE * options.images), min(1, options.images - 1))
+    held_back = set(order[:count].tolist())
+    for file, chosen in (("train.txt", False), ("val.txt", True)):
+        lines = [f"{name}\n" for index, name in enumerate(names) if (index in held_back) == chosen]
+        write_text(out / file, "".join(lines))
+    return float(np.median(seconds)) if seconds else 0.0
+
+
+def render_view(seed: int, options: TrainingOptions) -> tuple[np.ndarray, np.ndarray, dict]:
+    """One image (H, W, 3), its labels (H, W) and the record of what was drawn."""
+    recipe, view = draw_world(seed, options.scene), draw_view(seed)
+    path = make_path(recipe.drive, _LENGTH_M)
+    ground = Ground(recipe.relief, recipe.sand, recipe.backdrop)
+    drive = Drive(recipe.drive, path, _LENGTH_M, bare_ground(ground, WHEEL_FEEL_M))
+    T_world_body = drive.T_world_body(np.array([drive.duration_s]))[0]
+    T_world_camera = _camera_pose(T_world_body, view)
+    x, y = T_world_camera[:2, 3]
+    heading = float(np.arctan2(-T_world_body[1, 0], -T_world_body[0, 0]))
+    # A little over two pixels across; along the view, the ground is seen aslant.
+    steps = (3.0 / options.width_px, 4.0 / options.width_px)
+    points = Points(*fan((float(x), float(y)), heading, np.deg2rad(52), (0.4, 170.0), steps))
+    places = _feature_places(recipe.seed, np.array([x, y]), heading)
+    world = build_world(recipe, path, points, places, in_view=(np.array([x, y]), heading, np.deg2rad(60)))
+    lighting = make_lighting(recipe.sky)
+    textures = make_textures(recipe.sand, recipe.stone, size=512)
+    renderer = Renderer(world.mesh, textures, lighting, rover_mesh())
+    renderer.place_rover(T_world_body if view.rover else None)
+    rays = camera_rays(_pixels(options, view), T_world_camera)
+    radiance = renderer.radiance(rays, options.samples, (seed,))
+    corner = corner_distance(options.height_px, options.width_px)
+    noise = np.random.default_rng([seed, 0x401])
+    image = develop(radiance, recipe.exposure, sand_exposure(recipe, lighting), noise, corner)
+    labels = _without_specks(renderer.first_hits(rays), world.mesh)
+    return image, labels, {"recipe": asdict(recipe), "view": asdict(view)}
+
+
+def _without_specks(hits: FirstHits, mesh: Mesh) -> np.ndarray:
+    """The classes, and `IGNORE` where a rock is too far away to be told from a pebble."""
+    labels = surface_labels(hits, mesh)
+    is_rock = labels == ROCK
+    rock = mesh.part[hits.face[is_rock]]
+    pixels = np.bincount(rock)
+    labels[is_rock] = np.where(pixels[rock] < LEAST_ROCK_PX, IGNORE, ROCK)
+    return labels
+
+
+def _camera_pose(T_world_body: np.ndarray, view: View) -> np.ndarray:
+    forward, right, up = -T_world_body[:3, 0], T_world_body[:3, 1], T_world_body[:3, 2]
+    level = np.stack([right, -up, forward], axis=1)
+    turn = Rotation.from_euler("zx", [view.roll_deg, -view.pitch_deg], degrees=True).as_matrix()
+    T = np.eye(4)
+    T[:3, :3] = level @ turn
+    ground = T_world_body[:3, 3] - 0.543 * up
+    T[:3, 3] = ground + view.height_m * up + 0.4 * forward
+    return T
+
+
+def _pixels(options: TrainingOptions, view: View) -> np.ndarray:
+    """LocCam's lens, its focal length changed, on a sensor of the shape that is asked for."""
+    rig = loccam()
+    focal = rig.K_left[0, 0] / rig.width_px * options.width_px * view.zoom
+    K = np.array([[focal, 0, (options.width_px - 1) / 2], [0, focal, (options.height_px - 1) / 2], [0, 0, 1]])
+    return undistorted_pixels(K, rig.distortion_left, options.width_px, options.height_px)
+
+
+def _feature_places(seed: int, camera_m: np.ndarray, heading_rad: float) -> np.ndarray:
+    rng = np.random.default_rng([seed, 0xFEA7])
+    angle = heading_rad + rng.uniform(-0.5, 0.5, 8)
+    distance = np.exp(rng.uniform(np.log(1.8), np.log(12.0), 8))
+    return camera_m + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
