@@ -16,7 +16,6 @@ from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.files import atomic_path
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.compilation import inference_options
 from jaxmap.models.deeplab import Images, Weights, inference_network
 from jaxmap.models.pixelwise import check_size, resized_input, resized_output
 from jaxmap.report.pictures import overlay_labels
@@ -42,7 +41,7 @@ class Segmenter:
             logits = network.apply(weights, resized_input(images, size))
             return resized_output(logits, images.shape[1:3])
 
-        self._run = jax.jit(run, compiler_options=inference_options())
+        self._run = jax.jit(run)
 
     def logits(self, image: UInt8[np.ndarray, "H W *rgb"]) -> Float[np.ndarray, "H W C"]:
         """Class logits of a grey or RGB image, at its own size.

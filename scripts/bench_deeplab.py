@@ -46,7 +46,6 @@ def ours(state: dict, image) -> tuple[Runner, float]:
     import jax
     from safetensors.numpy import save_file
 
-    from jaxmap.models.compilation import inference_options
     from jaxmap.models.deeplab import inference_network
     from jaxmap.models.importers import import_weights
 
@@ -54,7 +53,7 @@ def ours(state: dict, image) -> tuple[Runner, float]:
         save_file(state, Path(folder) / "smp.safetensors")
         imported = import_weights(Path(folder) / "smp.safetensors")
     network = inference_network(imported.architecture, imported.weights)
-    compiled = jax.jit(network.apply).lower(network.weights, image).compile(compiler_options=inference_options())
+    compiled = jax.jit(network.apply).lower(network.weights, image).compile()
     gflop = compiled.cost_analysis()["flops"] / 1e9
     return lambda: compiled(network.weights, image).block_until_ready(), gflop
 

@@ -6,9 +6,8 @@ shifted slices, and a 1x1 convolution takes twice as long as the same matrix pro
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-from functools import cache, partial, reduce
+from collections.abc import Iterator
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -19,9 +18,6 @@ from jaxtyping import Array, Float
 from jaxmap.models import convolution_gradients as gradients
 from jaxmap.models.architecture import Padding
 from jaxmap.models.convolution_gradients import PRECISION, Sliding
-
-FEW_CHANNELS = 4
-"""An image's channels, as opposed to features: the library takes twice as long with so few as with twice as many."""
 
 
 def pad_amounts(size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> tuple[int, int]:
@@ -45,29 +41,13 @@ def convolve(
     dilation: int = 1,
     padding: Padding = "torch",
     depthwise: bool = False,
-    row_padding: tuple[int, int] | None = None,
 ) -> Float[Array, "B h w O"]:
-    """Convolution without bias.
-
-    Args:
-        images: what is convolved.
-        kernel: a depthwise one has G = 1 and as many outputs as inputs.
-        stride: input pixels for each output pixel, along both axes.
-        dilation: input pixels from one element of the kernel to the next.
-        padding: how many zeros are put around the images, see `pad_amounts`.
-        depthwise: whether each channel has a kernel of its own.
-        row_padding: zeros above and below, where only a band of an image's rows is given (depthwise only).
-    """
+    """Convolution without bias; a depthwise kernel has G = 1 and as many outputs as inputs."""
     size = kernel.shape[0]
     if depthwise:
-        forward = partial(
-            depthwise_convolve, stride=stride, dilation=dilation, padding=padding, row_padding=row_padding
-        )
+        forward = partial(depthwise_convolve, stride=stride, dilation=dilation, padding=padding)
         top, left = (pad_amounts(images.shape[axis], size, stride, dilation, padding)[0] for axis in (1, 2))
-        top = top if row_padding is None else row_padding[0]
         return gradients.depthwise(forward, Sliding(size, stride, dilation, (top, left)), images, kernel)
-    if stride == 2 and size == 3 and images.shape[3] <= FEW_CHANNELS and images.shape[2] % 2 == 0:
-        return _convolve_pairs(images, kernel, padding)
     if size == 1:
         return gradients.pointwise(images[:, ::stride, ::stride], kernel[0, 0])
     # Other products promote by themselves, as double precision needs.
@@ -83,33 +63,6 @@ def convolve(
     )
 
 
-def _convolve_pairs(
-    images: Float[Array, "B H W I"], kernel: Float[Array, "K K I O"], padding: Padding
-) -> Float[Array, "B h w O"]:
-    """Convolution at stride 2, two columns of the image taken as one of twice the channels.
-
-    That is the same memory, read another way; the kernel gets a column of zeros where it lacks one.
-    """
-    batch, height, width, channels = images.shape
-    size, outputs = kernel.shape[0], kernel.shape[3]
-    rows = pad_amounts(height, size, 2, 1, padding)
-    before, after = pad_amounts(width, size, 2, 1, padding)
-    odd = before % 2
-    count = (width + before + after - size) // 2 + 1
-    pairs = -(-(size + odd) // 2)
-    kernel = jnp.pad(kernel, ((0, 0), (odd, 2 * pairs - size - odd), (0, 0), (0, 0)))
-    first = (before + odd) // 2
-    dtype = jnp.result_type(images, kernel)
-    return jax.lax.conv_general_dilated(
-        images.reshape(batch, height, width // 2, 2 * channels).astype(dtype),
-        kernel.reshape(size, pairs, 2 * channels, outputs).astype(dtype),
-        window_strides=(2, 1),
-        padding=[rows, (first, count + pairs - 1 - first - width // 2)],
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=PRECISION,
-    )
-
-
 def depthwise_convolve(
     images: Float[Array, "B H W C"],
     kernel: Float[Array, "K K 1 C"],
@@ -117,98 +70,64 @@ def depthwise_convolve(
     stride: int = 1,
     dilation: int = 1,
     padding: Padding = "torch",
-    row_padding: tuple[int, int] | None = None,
 ) -> Float[Array, "B h w C"]:
-    """Each channel with its own kernel, as a sum of shifted slices; arguments are those of `convolve`."""
-
-    def weighted(windows: list[_Window]) -> Array:
-        terms = [pixels * kernel[row, column, 0] for row, column, pixels in windows]
-        return sum(terms[1:], start=terms[0])
-
-    size = kernel.shape[0]
-    paddings = [pad_amounts(images.shape[axis], size, stride, dilation, padding) for axis in (1, 2)]
-    return _over_windows(weighted, images, size, stride, dilation, (row_padding or paddings[0], paddings[1]))
+    """Each channel with its own kernel, as a sum of shifted slices."""
+    total: Array | float = 0.0
+    for row, column, window in _windows(images, kernel.shape[0], stride, dilation, padding, 0.0):
+        total = total + window * kernel[row, column, 0]
+    return jnp.asarray(total)
 
 
 def max_pool(
     images: Float[Array, "B H W C"], *, size: int = 3, stride: int = 2, padding: Padding = "torch"
 ) -> Float[Array, "B h w C"]:
     """The largest value in each window; what is padded never wins."""
-
-    def largest(windows: list[_Window]) -> Array:
-        return reduce(jnp.maximum, [pixels for _, _, pixels in windows])
-
-    rows, columns = (pad_amounts(images.shape[axis], size, stride, 1, padding) for axis in (1, 2))
-    return _over_windows(largest, images, size, stride, 1, (rows, columns))
-
-
-class _Window(NamedTuple):
-    """Row and column of an element of a kernel, and the pixels that it meets."""
-
-    row: int
-    column: int
-    pixels: Array
+    windows = [window for _, _, window in _windows(images, size, stride, 1, padding, -jnp.inf)]
+    largest = windows[0]
+    for window in windows[1:]:
+        largest = jnp.maximum(largest, window)
+    return largest
 
 
-def _over_windows(
-    function: Callable[[list[_Window]], Array],
-    images: Array,
-    size: int,
-    stride: int,
-    dilation: int,
-    paddings: tuple[tuple[int, int], tuple[int, int]],
-) -> Array:
-    """The image that `function` makes of a kernel's windows.
+def _windows(
+    images: Array, size: int, stride: int, dilation: int, padding: Padding, fill: float
+) -> Iterator[tuple[int, int, Array]]:
+    """Row and column of each element of a kernel, and the pixels that it meets.
 
-    Nothing is padded: where elements of the kernel meet nothing but padding, at the edges, they are left out, and
-    the parts that each have their own elements are put together. That spares a copy of the image, which at a
-    dilation as large as the image would be nine times its size.
+    Elements that meet nothing but padding are left out, and nothing is padded for them: at a dilation
+    as large as the image (36 on 32x32 features) only the middle one is left.
     """
-    rows, columns = (
-        _parts(images.shape[axis], size, stride, dilation, amounts) for axis, amounts in enumerate(paddings, start=1)
-    )
-    # XLA would compute what makes the image anew for each of the windows.
-    images = jax.lax.optimization_barrier(images)
-
-    def part(vertical: _Taps, horizontal: _Taps) -> Array:
-        return function(
-            [
-                _Window(row, column, images[:, down, across])
-                for row, down in vertical
-                for column, across in horizontal
-            ]
-        )
-
-    return jnp.concatenate(
-        [jnp.concatenate([part(vertical, horizontal) for horizontal in columns], axis=2) for vertical in rows], axis=1
-    )
+    rows = _Axis.of(images.shape[1], size, stride, dilation, padding)
+    columns = _Axis.of(images.shape[2], size, stride, dilation, padding)
+    padded = jnp.pad(images, ((0, 0), rows.pad, columns.pad, (0, 0)), constant_values=fill)
+    # Without the barrier XLA computes the padding anew for each of the slices.
+    padded = jax.lax.optimization_barrier(padded)
+    for row, vertical in rows.taps:
+        for column, horizontal in columns.taps:
+            yield row, column, padded[:, vertical, horizontal]
 
 
-_Taps = list[tuple[int, slice]]
-"""Elements of a kernel along an axis, and the slice of the image that each meets."""
+class _Axis(NamedTuple):
+    """How a kernel slides along one axis: the padding needed, and the slice that each element meets."""
 
+    pad: tuple[int, int]
+    taps: list[tuple[int, slice]]
 
-@cache
-def _parts(size: int, kernel: int, stride: int, dilation: int, padding: tuple[int, int]) -> list[_Taps]:
-    """The parts of an axis in which the same elements of a kernel lie inside the image."""
-    before, after = padding
-    count = (size + before + after - dilation * (kernel - 1) - 1) // stride + 1
-    offsets = [index * dilation - before for index in range(kernel)]
-    begins = [min(max(-(offset // stride), 0), count) for offset in offsets]
-    ends = [min(max((size - 1 - offset) // stride + 1, 0), count) for offset in offsets]
-    cuts = sorted({0, count, *begins, *ends})
-    return [
-        [
-            (index, slice(first * stride + offset, (last - 1) * stride + offset + 1, stride))
-            for index, offset in enumerate(offsets)
-            if begins[index] <= first and last <= ends[index]
-        ]
-        for first, last in itertools.pairwise(cuts)
-    ]
+    @classmethod
+    def of(cls, size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> _Axis:
+        before, after = pad_amounts(size, kernel, stride, dilation, padding)
+        count = (size + before + after - dilation * (kernel - 1) - 1) // stride + 1
+        firsts = {index: index * dilation - before for index in range(kernel)}
+        span = (count - 1) * stride
+        firsts = {index: first for index, first in firsts.items() if first < size and first + span >= 0}
+        start = max(0, -min(firsts.values()))
+        end = max(0, max(firsts.values()) + span - (size - 1))
+        taps = [(index, slice(first + start, first + start + span + 1, stride)) for index, first in firsts.items()]
+        return cls((start, end), taps)
 
 
 @cache
-def resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each target pixel along an axis: the source pixels before and after it, and the share of the latter."""
     index = np.arange(target, dtype=np.float64)
     if align_corners:
@@ -224,7 +143,7 @@ def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> 
     source = images.shape[axis]
     if source == target:
         return images
-    low, high, share = resize_taps(source, target, align_corners)
+    low, high, share = _resize_taps(source, target, align_corners)
     shares = share.reshape([-1 if place == axis else 1 for place in range(4)])
     # Two taps a pixel: five times faster than a product with the matrix of weights.
     before = jnp.take(images, low, axis=axis, mode="clip")
@@ -240,7 +159,7 @@ def _resize_axis_backward(target: int, axis: int, align_corners: bool, before: A
     source = len(before)
     if source == target:
         return (cotangent,)
-    return (gradients.resized(cotangent, resize_taps(source, target, align_corners), source, axis),)
+    return (gradients.resized(cotangent, _resize_taps(source, target, align_corners), source, axis),)
 
 
 _resize_axis.defvjp(_resize_axis_forward, _resize_axis_backward)
@@ -258,5 +177,5 @@ def resize_rows(matrix: Float[np.ndarray, "source N"], target: int, *, align_cor
 
     The identity becomes the matrix that takes the pixels there to those wanted.
     """
-    low, high, share = resize_taps(len(matrix), target, align_corners)
+    low, high, share = _resize_taps(len(matrix), target, align_corners)
     return matrix[low] + (matrix[high] - matrix[low]) * share[:, None]

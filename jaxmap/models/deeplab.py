@@ -62,10 +62,10 @@ class DeepLab(nnx.Module):
             features, low_level = self.backbone(normalise(images, self.record))
         with jax.named_scope("aspp"):
             features = self.aspp(features, dropout_key)
-        if self.decoder is None:
-            return self.classifier(features)
-        with jax.named_scope("decoder"):
-            return self.decoder(features, low_level, self.classifier)
+        if self.decoder is not None:
+            with jax.named_scope("decoder"):
+                features = self.decoder(features, low_level)
+        return self.classifier(features)
 
 
 def padded_size(size: int, record: Architecture) -> int:
@@ -221,7 +221,7 @@ def inference_network(architecture: Architecture, weights: Mapping[str, ArrayLik
     """
     architecture, result = fold_batch_norm(architecture, {name: jnp.asarray(value) for name, value in weights.items()})
     if jax.default_backend() == "cpu":
-        for path, block in nnx.iter_graph(nnx.eval_shape(lambda: DeepLab(architecture))):
+        for path, block in nnx.iter_modules(nnx.eval_shape(lambda: DeepLab(architecture))):
             if isinstance(block, ConvBlock) and block.transformable:
                 name = ".".join(map(str, (*path, "kernel")))
                 result[name] = transformed_kernel(result[name])

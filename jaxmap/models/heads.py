@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import reduce
-
 import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.convolution_gradients import pointwise
 from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.layers import ConvBlock, SeparableBlock
-from jaxmap.models.upsampled import separable_on_upsampled
-
-PRODUCTS = 9
-"""Coarse products that `separable_on_upsampled` makes with a 3x3 kernel, in the place of a fine one."""
 
 
 def _separable(inputs: int, record: Architecture, dilation: int = 1) -> SeparableBlock:
@@ -59,11 +51,10 @@ class Aspp(nnx.Module):
     ) -> Float[Array, "B H W C"]:
         """Applies the pyramid; features are dropped only where a key is given."""
         pooled = self.pool(features.mean(axis=(1, 2), keepdims=True))
+        pooled = jnp.broadcast_to(pooled, (*features.shape[:3], pooled.shape[3]))
         branches = [self.point(features), *(branch(features) for branch in self.atrous)]
         branches = [pooled, *branches] if self.pool_first else [*branches, pooled]
-        # Projected one by one: nothing need be joined, and the pooled branch is projected once, not for each pixel.
-        kernels = jnp.split(self.project.kernel[0, 0], len(branches))
-        result = self.project.finish(reduce(jnp.add, map(pointwise, branches, kernels)))
+        result = self.project(jnp.concatenate(branches, axis=-1))
         if dropout_key is not None and self.dropout > 0:
             kept = jax.random.bernoulli(dropout_key, 1 - self.dropout, result.shape)
             result = jnp.where(kept, result / (1 - self.dropout), 0)
@@ -80,30 +71,14 @@ class Decoder(nnx.Module):
             _separable(inputs if index == 0 else record.head_channels, record) for index in range(record.decoder_convs)
         )
         self.align_corners = record.align_corners
-        # Norms of batches need all pixels at once.
-        self.in_bands = not (record.head_norm or record.norm_inside) and record.decoder_convs == 1
 
     def __call__(
-        self,
-        features: Float[Array, "B h w C"],
-        low_level: Float[Array, "B H W L"],
-        classifier: Callable[[Float[Array, "B b W C"]], Float[Array, "B b W K"]],
-    ) -> Float[Array, "B H W K"]:
-        """Applies the decoder, then the classifier; the result has the size of `low_level`."""
+        self, features: Float[Array, "B h w C"], low_level: Float[Array, "B H W L"]
+    ) -> Float[Array, "B H W C"]:
+        """Applies the decoder; the result has the size of `low_level`."""
         low_level = self.reduce(low_level)
-        coarse, fine = features.shape[1:3], low_level.shape[1:3]
-        if self.in_bands and PRODUCTS * coarse[0] * coarse[1] <= fine[0] * fine[1]:
-            block = self.refine[0]
-            return separable_on_upsampled(
-                features,
-                low_level,
-                block.depthwise.kernel[...],
-                block.pointwise.kernel[0, 0],
-                lambda band: classifier(block.pointwise.finish(band)),
-                align_corners=self.align_corners,
-            )
         features = resize_bilinear(features, *low_level.shape[1:3], align_corners=self.align_corners)
         features = jnp.concatenate([features, low_level], axis=-1)
         for block in self.refine:
             features = block(features)
-        return classifier(features)
+        return features

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Activation, Norm, Padding
 from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
-from jaxmap.models.convolution_gradients import pointwise
 from jaxmap.models.convolutions import convolve
 from jaxmap.models.winograd import MIN_CHANNELS, convolve_transformed
 
@@ -24,7 +23,8 @@ class ConvBlock(nnx.Module):
     """Convolution, then batch norm or a bias, then an activation.
 
     Weights: `kernel` (K, K, I, O), or (K, K, 1, C) depthwise; `norm.{scale,bias,mean,var}` (O,) where
-    `norm` is `batch`, `bias` (O,) where it is `bias`.
+    `norm` is `batch`, `bias` (O,) where it is `bias`. For inference, the kernel of a `transformable` block may be the
+    (4, 4, I, O) that `winograd.transformed_kernel` makes of it.
     """
 
     def __init__(
@@ -52,42 +52,31 @@ class ConvBlock(nnx.Module):
             else None
         )
 
-    def __call__(
-        self, images: Float[Array, "B H W I"], row_padding: tuple[int, int] | None = None
-    ) -> Float[Array, "B h w O"]:
-        """Applies the block; on a band of an image's rows with the padding that is said."""
+    def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
+        """Applies the block."""
         kernel = self.kernel[...]
         if kernel.shape[0] != self.size:
-            return self.finish(convolve_transformed(images, kernel, self.dilation))
-        images = convolve(
-            images,
-            kernel,
-            stride=self.stride,
-            dilation=self.dilation,
-            padding=self.padding,
-            depthwise=self.depthwise,
-            row_padding=row_padding,
-        )
-        return self.finish(images)
-
-    @property
-    def linear(self) -> bool:
-        """Whether nothing follows the convolution."""
-        return self.bias is None and self.norm is None and self.activation == "none"
-
-    @property
-    def transformable(self) -> bool:
-        """Whether `winograd.transformed_kernel` may take the kernel's place, and makes the block faster."""
-        plain = self.size == 3 and self.stride == 1 and not self.depthwise
-        return plain and min(self.kernel.shape[2:]) >= MIN_CHANNELS
-
-    def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
-        """What follows the convolution: bias or norm, then the activation."""
+            images = convolve_transformed(images, kernel, self.dilation)
+        else:
+            images = convolve(
+                images,
+                kernel,
+                stride=self.stride,
+                dilation=self.dilation,
+                padding=self.padding,
+                depthwise=self.depthwise,
+            )
         if self.bias is not None:
             return add_bias(images, self.bias[...], self.activation)
         if self.norm is not None:
             return self.norm(images, self.activation)
         return activate(images, self.activation)
+
+    @property
+    def transformable(self) -> bool:
+        """Whether the kernel may be transformed, and the block becomes faster by it."""
+        plain = self.size == 3 and self.stride == 1 and not self.depthwise
+        return plain and min(self.kernel.shape[2:]) >= MIN_CHANNELS
 
 
 class SeparableBlock(nnx.Module):
@@ -126,12 +115,7 @@ class SeparableBlock(nnx.Module):
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the block."""
-        inner, outer = self.depthwise, self.pointwise
-        if inner.linear and inner.dilation >= max(images.shape[1:3]):
-            # Only the middle of the kernel meets the image.
-            kernel = inner.kernel[1, 1, 0][:, None] * outer.kernel[0, 0]
-            return outer.finish(pointwise(images, kernel))
-        return outer(inner(images))
+        return self.pointwise(self.depthwise(images))
 
 
 def dilations(strides: list[int], start: int, output_stride: int, dilate_first: bool) -> list[tuple[int, int]]:

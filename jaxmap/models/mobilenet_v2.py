@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from jaxmap.models.architecture import Architecture, Padding
-from jaxmap.models.bands import rows_per_band
-from jaxmap.models.convolutions import pad_amounts
+from jaxmap.models.architecture import Architecture
 from jaxmap.models.layers import ConvBlock, dilations
 
 STAGES = ((1, 16, 1, 1), (6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1))
@@ -18,9 +15,6 @@ LOW_LEVEL_UNIT = 2
 """The unit whose output is the low-level feature: the last at stride 4, 24 channels."""
 
 TOP_CHANNELS = 1280
-
-HIDDEN_BYTES = 4 << 20
-"""What a unit may hold at once of its widest tensor."""
 
 
 class InvertedResidual(nnx.Module):
@@ -53,31 +47,12 @@ class InvertedResidual(nnx.Module):
         )
         self.project = ConvBlock(hidden, outputs, norm=norm, eps=eps, activation="none")
         self.shortcut = stride == 1 and inputs == outputs
-        self.hidden, self.stride, self.dilation = hidden, stride, dilation
-        self.padding: Padding = record.padding
-        # Norms of batches need all pixels at once.
-        self.in_bands = not record.backbone_norm
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the unit."""
-        batch, height, width, _ = images.shape
-        before, after = pad_amounts(height, 3, self.stride, self.dilation, self.padding)
-        rows = (height + before + after - 2 * self.dilation - 1) // self.stride + 1
-        band = rows
-        if self.in_bands:
-            band = rows_per_band(rows, 4 * batch * self.stride * width * self.hidden, HIDDEN_BYTES)
-        result = jnp.concatenate(
-            [self._rows(images, first, min(first + band, rows), before) for first in range(0, rows, band)], axis=1
-        )
-        return images + result if self.shortcut else result
-
-    def _rows(self, images: Array, first: int, last: int, before: int) -> Array:
-        """Rows `first` to before `last` of what is added to the input, from the rows of it that they need."""
-        top, bottom = first * self.stride - before, (last - 1) * self.stride - before + 2 * self.dilation + 1
-        padding = (max(-top, 0), max(bottom - images.shape[1], 0))
-        images = images[:, max(top, 0) : bottom]
         hidden = images if self.expand is None else self.expand(images)
-        return self.project(self.depthwise(hidden, padding))
+        result = self.project(self.depthwise(hidden))
+        return images + result if self.shortcut else result
 
 
 class MobileNetV2(nnx.Module):
