@@ -62,10 +62,10 @@ class DeepLab(nnx.Module):
             features, low_level = self.backbone(normalise(images, self.record))
         with jax.named_scope("aspp"):
             features = self.aspp(features, dropout_key)
-        if self.decoder is not None:
-            with jax.named_scope("decoder"):
-                features = self.decoder(features, low_level)
-        return self.classifier(features)
+        if self.decoder is None:
+            return self.classifier(features)
+        with jax.named_scope("decoder"):
+            return self.decoder(features, low_level, self.classifier)
 
 
 def padded_size(size: int, record: Architecture) -> int:

@@ -66,6 +66,10 @@ class ConvBlock(nnx.Module):
                 padding=self.padding,
                 depthwise=self.depthwise,
             )
+        return self.finish(images)
+
+    def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
+        """What follows the convolution: bias or norm, then the activation."""
         if self.bias is not None:
             return add_bias(images, self.bias[...], self.activation)
         if self.norm is not None:
