@@ -16,7 +16,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.files import atomic_path
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import Images, Weights, fold_batch_norm, pure_network
+from jaxmap.models.deeplab import Images, Weights, inference_network
 from jaxmap.models.pixelwise import check_size, resized_input, resized_output
 from jaxmap.report.pictures import overlay_labels
 
@@ -34,9 +34,8 @@ class Segmenter:
 
     def __init__(self, model: SavedModel, size: tuple[int, int] | None = None) -> None:
         check_size(size, "--size")
-        architecture, weights = fold_batch_norm(model.architecture, model.weights)
-        network = pure_network(architecture, weights)
-        self.classes, self._weights = architecture.classes, network.weights
+        network = inference_network(model.architecture, model.weights)
+        self.classes, self._weights = network.architecture.classes, network.weights
 
         def run(weights: Weights, images: Images) -> jax.Array:
             logits = network.apply(weights, resized_input(images, size))

@@ -42,17 +42,17 @@ def limit_threads(count: int) -> None:
 
 
 def ours(state: dict, image) -> tuple[Runner, float]:
-    """Our network with folded batch norm, and how many GFLOP its compiled program counts."""
+    """Our network as `jaxmap segment` runs it, and how many GFLOP its compiled program counts."""
     import jax
     from safetensors.numpy import save_file
 
-    from jaxmap.models.deeplab import fold_batch_norm, pure_network
+    from jaxmap.models.deeplab import inference_network
     from jaxmap.models.importers import import_weights
 
     with tempfile.TemporaryDirectory() as folder:
         save_file(state, Path(folder) / "smp.safetensors")
         imported = import_weights(Path(folder) / "smp.safetensors")
-    network = pure_network(*fold_batch_norm(imported.architecture, imported.weights))
+    network = inference_network(imported.architecture, imported.weights)
     compiled = jax.jit(network.apply).lower(network.weights, image).compile()
     gflop = compiled.cost_analysis()["flops"] / 1e9
     return lambda: compiled(network.weights, image).block_until_ready(), gflop

@@ -127,7 +127,7 @@ class _Axis(NamedTuple):
 
 
 @cache
-def _resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each target pixel along an axis: the source pixels before and after it, and the share of the latter."""
     index = np.arange(target, dtype=np.float64)
     if align_corners:
@@ -143,7 +143,7 @@ def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> 
     source = images.shape[axis]
     if source == target:
         return images
-    low, high, share = _resize_taps(source, target, align_corners)
+    low, high, share = resize_taps(source, target, align_corners)
     shares = share.reshape([-1 if place == axis else 1 for place in range(4)])
     # Two taps a pixel: five times faster than a product with the matrix of weights.
     before = jnp.take(images, low, axis=axis, mode="clip")
@@ -159,7 +159,7 @@ def _resize_axis_backward(target: int, axis: int, align_corners: bool, before: A
     source = len(before)
     if source == target:
         return (cotangent,)
-    return (gradients.resized(cotangent, _resize_taps(source, target, align_corners), source, axis),)
+    return (gradients.resized(cotangent, resize_taps(source, target, align_corners), source, axis),)
 
 
 _resize_axis.defvjp(_resize_axis_forward, _resize_axis_backward)
@@ -177,5 +177,5 @@ def resize_rows(matrix: Float[np.ndarray, "source N"], target: int, *, align_cor
 
     The identity becomes the matrix that takes the pixels there to those wanted.
     """
-    low, high, share = _resize_taps(len(matrix), target, align_corners)
+    low, high, share = resize_taps(len(matrix), target, align_corners)
     return matrix[low] + (matrix[high] - matrix[low]) * share[:, None]

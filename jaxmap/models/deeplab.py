@@ -19,6 +19,7 @@ from jaxmap.models.heads import Aspp, Decoder
 from jaxmap.models.layers import ConvBlock
 from jaxmap.models.mobilenet_v2 import MobileNetV2
 from jaxmap.models.resnet import ResNet
+from jaxmap.models.winograd import transformed_kernel
 from jaxmap.models.xception import Xception65
 
 Weights = dict[str, Array]
@@ -61,10 +62,10 @@ class DeepLab(nnx.Module):
             features, low_level = self.backbone(normalise(images, self.record))
         with jax.named_scope("aspp"):
             features = self.aspp(features, dropout_key)
-        if self.decoder is not None:
-            with jax.named_scope("decoder"):
-                features = self.decoder(features, low_level)
-        return self.classifier(features)
+        if self.decoder is None:
+            return self.classifier(features)
+        with jax.named_scope("decoder"):
+            return self.decoder(features, low_level, self.classifier)
 
 
 def padded_size(size: int, record: Architecture) -> int:
@@ -211,3 +212,17 @@ def fold_batch_norm(architecture: Architecture, weights: Weights) -> tuple[Archi
         result[f"{block}.kernel"] = weights[f"{block}.kernel"] * gain
         result[f"{block}.bias"] = weights[f"{block}.norm.bias"] - mean * gain
     return folded(architecture), result
+
+
+def inference_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
+    """The network in the form that computes logits fastest; its weights are neither to be trained nor to be kept.
+
+    Batch norm is folded, and on a CPU the kernels of large dense convolutions are transformed (`winograd`).
+    """
+    architecture, result = fold_batch_norm(architecture, {name: jnp.asarray(value) for name, value in weights.items()})
+    if jax.default_backend() == "cpu":
+        for path, block in nnx.iter_modules(nnx.eval_shape(lambda: DeepLab(architecture))):
+            if isinstance(block, ConvBlock) and block.transformable:
+                name = ".".join(map(str, (*path, "kernel")))
+                result[name] = transformed_kernel(result[name])
+    return pure_network(architecture, result)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -10,6 +12,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.layers import ConvBlock, SeparableBlock
+from jaxmap.models.upsampled import separable_on_upsampled
+
+PRODUCTS = 9
+"""Coarse products that `separable_on_upsampled` makes with a 3x3 kernel, in the place of a fine one."""
 
 
 def _separable(inputs: int, record: Architecture, dilation: int = 1) -> SeparableBlock:
@@ -71,14 +77,30 @@ class Decoder(nnx.Module):
             _separable(inputs if index == 0 else record.head_channels, record) for index in range(record.decoder_convs)
         )
         self.align_corners = record.align_corners
+        # Batch norms that learn need all pixels at once.
+        self.mergeable = not (record.head_norm or record.norm_inside) and record.decoder_convs == 1
 
     def __call__(
-        self, features: Float[Array, "B h w C"], low_level: Float[Array, "B H W L"]
-    ) -> Float[Array, "B H W C"]:
-        """Applies the decoder; the result has the size of `low_level`."""
+        self,
+        features: Float[Array, "B h w C"],
+        low_level: Float[Array, "B H W L"],
+        classifier: Callable[[Float[Array, "B b W C"]], Float[Array, "B b W K"]],
+    ) -> Float[Array, "B H W K"]:
+        """Applies the decoder, then the classifier, pixel by pixel; the result has the size of `low_level`."""
         low_level = self.reduce(low_level)
+        coarse, fine = features.shape[1:3], low_level.shape[1:3]
+        if self.mergeable and PRODUCTS * coarse[0] * coarse[1] <= fine[0] * fine[1]:
+            block = self.refine[0]
+            return separable_on_upsampled(
+                features,
+                low_level,
+                block.depthwise.kernel[...],
+                block.pointwise.kernel[0, 0],
+                lambda band: classifier(block.pointwise.finish(band)),
+                align_corners=self.align_corners,
+            )
         features = resize_bilinear(features, *low_level.shape[1:3], align_corners=self.align_corners)
         features = jnp.concatenate([features, low_level], axis=-1)
         for block in self.refine:
             features = block(features)
-        return features
+        return classifier(features)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxmap.models.architecture import Activation, Norm, Padding
 from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
 from jaxmap.models.convolutions import convolve
+from jaxmap.models.winograd import MIN_CHANNELS, convolve_transformed
 
 BATCH_NORM_MOMENTUM = 0.9
 """Weight of the old running statistics; torch calls the same 0.1."""
@@ -22,7 +23,8 @@ class ConvBlock(nnx.Module):
     """Convolution, then batch norm or a bias, then an activation.
 
     Weights: `kernel` (K, K, I, O), or (K, K, 1, C) depthwise; `norm.{scale,bias,mean,var}` (O,) where
-    `norm` is `batch`, `bias` (O,) where it is `bias`.
+    `norm` is `batch`, `bias` (O,) where it is `bias`. For inference, the kernel of a `transformable` block may be the
+    (4, 4, I, O) that `winograd.transformed_kernel` makes of it.
     """
 
     def __init__(
@@ -39,7 +41,7 @@ class ConvBlock(nnx.Module):
         eps: float = 1e-5,
         activation: Activation = "relu",
     ) -> None:
-        self.stride, self.dilation, self.depthwise = stride, dilation, depthwise
+        self.size, self.stride, self.dilation, self.depthwise = size, stride, dilation, depthwise
         self.padding: Padding = padding
         self.activation: Activation = activation
         self.kernel = nnx.Param(jnp.zeros((size, size, 1 if depthwise else inputs, outputs)))
@@ -52,19 +54,33 @@ class ConvBlock(nnx.Module):
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the block."""
-        images = convolve(
-            images,
-            self.kernel[...],
-            stride=self.stride,
-            dilation=self.dilation,
-            padding=self.padding,
-            depthwise=self.depthwise,
-        )
+        kernel = self.kernel[...]
+        if kernel.shape[0] != self.size:
+            images = convolve_transformed(images, kernel, self.dilation)
+        else:
+            images = convolve(
+                images,
+                kernel,
+                stride=self.stride,
+                dilation=self.dilation,
+                padding=self.padding,
+                depthwise=self.depthwise,
+            )
+        return self.finish(images)
+
+    def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
+        """What follows the convolution: bias or norm, then the activation."""
         if self.bias is not None:
             return add_bias(images, self.bias[...], self.activation)
         if self.norm is not None:
             return self.norm(images, self.activation)
         return activate(images, self.activation)
+
+    @property
+    def transformable(self) -> bool:
+        """Whether the kernel may be transformed, and the block becomes faster by it."""
+        plain = self.size == 3 and self.stride == 1 and not self.depthwise
+        return plain and min(self.kernel.shape[2:]) >= MIN_CHANNELS
 
 
 class SeparableBlock(nnx.Module):

@@ -11,7 +11,7 @@ import pytest
 from golden.seeded_weights import seeded_image, seeded_state
 from safetensors.numpy import save_file
 
-from jaxmap.models.deeplab import fold_batch_norm, pure_network
+from jaxmap.models.deeplab import inference_network
 from jaxmap.models.importers import import_weights
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "smp_golden.npz"
@@ -41,8 +41,7 @@ def seeded_checkpoint(backbone: str, path: Path) -> Path:
 
 def check(backbone: str, stride: int, size: tuple[int, int], folder: Path) -> None:
     imported = import_weights(seeded_checkpoint(backbone, folder / "smp.safetensors"), output_stride=stride)
-    architecture, weights = fold_batch_norm(imported.architecture, imported.weights)
-    network = pure_network(architecture, weights)
+    network = inference_network(imported.architecture, imported.weights)
     logits = np.asarray(jax.jit(network.apply)(network.weights, seeded_image(*size)[None])[0])
     key = f"{backbone}_{stride}_{size[0]}x{size[1]}"
     with np.load(GOLDEN) as golden:

@@ -12,7 +12,7 @@ from flax import nnx
 from golden.seeded_weights import seeded_image, seeded_weights
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models.architecture import BACKBONES, check_architecture, tf_architecture, torch_architecture
+from jaxmap.models.architecture import BACKBONES, check_architecture, folded, tf_architecture, torch_architecture
 from jaxmap.models.deeplab import (
     DeepLab,
     fold_batch_norm,
@@ -122,10 +122,11 @@ def test_gradients_equal_finite_differences(make):
     check_gradient(make, lambda model: model(jnp.asarray(images)))
 
 
-def test_gradients_of_the_decoder_equal_finite_differences():
+@pytest.mark.parametrize("record", [SMALL, folded(SMALL)], ids=["batch norm", "folded"])
+def test_gradients_of_the_decoder_equal_finite_differences(record):
     draw = np.random.default_rng(0)
-    coarse, fine = draw.normal(size=(1, 3, 4, 8)), draw.normal(size=(1, 6, 8, 4))
-    check_gradient(lambda: Decoder(4, SMALL), lambda model: model(jnp.asarray(coarse), jnp.asarray(fine)))
+    coarse, fine = draw.normal(size=(1, 2, 3, 8)), draw.normal(size=(1, 7, 9, 4))
+    check_gradient(lambda: Decoder(4, record), lambda model: model(jnp.asarray(coarse), jnp.asarray(fine), jnp.tanh))
 
 
 def check_gradient(make, call):

@@ -1,0 +1,112 @@
+"""Upsampling after the products of a separable convolution is upsampling before them."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxmap.models import heads
+from jaxmap.models.architecture import torch_architecture
+from jaxmap.models.convolutions import convolve, resize_bilinear
+from jaxmap.models.deeplab import fold_batch_norm, initial_weights, pure_network
+from jaxmap.models.upsampled import by_bands, rows_per_band, separable_on_upsampled
+
+
+def normal(seed: int, *shape: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def position(target: int, count: int, source: int, align_corners: bool) -> float:
+    """Where a target pixel of `count` lies among those of `source`."""
+    if align_corners:
+        return target * (source - 1) / max(count - 1, 1)
+    return min(max((target + 0.5) * source / count - 0.5, 0), source - 1)
+
+
+def slowly(coarse, fine, depthwise, pointwise, align_corners):
+    """The slow twin, pixel by pixel as the definition says: upsample, join, depthwise, pointwise."""
+    size, (height, width) = depthwise.shape[0], fine.shape[1:3]
+    joined = np.zeros((*fine.shape[:3], coarse.shape[3] + fine.shape[3]))
+    for y, x in np.ndindex(height, width):
+        v = position(y, height, coarse.shape[1], align_corners)
+        u = position(x, width, coarse.shape[2], align_corners)
+        for row, column in np.ndindex(*coarse.shape[1:3]):
+            share = max(1 - abs(v - row), 0) * max(1 - abs(u - column), 0)
+            joined[:, y, x, : coarse.shape[3]] += share * coarse[:, row, column]
+        joined[:, y, x, coarse.shape[3] :] = fine[:, y, x]
+    result = np.zeros((*fine.shape[:3], pointwise.shape[1]))
+    for y, x, row, column in np.ndindex(height, width, size, size):
+        source = y + row - size // 2, x + column - size // 2
+        if 0 <= source[0] < height and 0 <= source[1] < width:
+            result[:, y, x] += (joined[:, *source] * depthwise[row, column, 0]) @ pointwise
+    return result
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    coarse_size=st.tuples(st.integers(1, 4), st.integers(1, 4)),
+    fine_size=st.tuples(st.integers(1, 11), st.integers(1, 11)),
+    size=st.sampled_from([1, 3, 5]),
+    batch=st.integers(1, 2),
+    align_corners=st.booleans(),
+)
+def test_upsampling_after_the_products_is_upsampling_before(coarse_size, fine_size, size, batch, align_corners):
+    arrays = normal(0, batch, *coarse_size, 3), normal(1, batch, *fine_size, 2)
+    kernels = normal(2, size, size, 1, 5), normal(3, 5, 4)
+    result = separable_on_upsampled(*map(jnp.asarray, (*arrays, *kernels)), jnp.abs, align_corners=align_corners)
+    np.testing.assert_allclose(result, np.abs(slowly(*arrays, *kernels, align_corners)), atol=1e-4)
+
+
+def test_it_has_the_gradients_of_the_plain_way():
+    shapes = ((1, 2, 3, 3), (1, 9, 11, 2), (3, 3, 1, 5), (5, 4))
+    arrays = [jnp.asarray(normal(seed, *shape)) for seed, shape in enumerate(shapes)]
+
+    def fast(*arrays):
+        return (separable_on_upsampled(*arrays, jnp.tanh, align_corners=True) ** 2).sum()
+
+    def plain(coarse, fine, depthwise, pointwise):
+        joined = jnp.concatenate([resize_bilinear(coarse, *fine.shape[1:3], align_corners=True), fine], axis=-1)
+        return (jnp.tanh(jnp.dot(convolve(joined, depthwise, depthwise=True), pointwise)) ** 2).sum()
+
+    for ours, theirs in zip(*(jax.grad(f, argnums=(0, 1, 2, 3))(*arrays) for f in (fast, plain)), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+@settings(max_examples=15, deadline=None)
+@given(rows=st.integers(1, 20), band=st.integers(1, 20))
+def test_bands_are_the_rows(rows, band):
+    band = min(rows, band)
+    image = jnp.asarray(normal(0, 2, rows, 3, 1))
+    result = by_bands(lambda first: 2 * jax.lax.dynamic_slice_in_dim(image, first, band, axis=1), rows, band)
+    np.testing.assert_array_equal(result, 2 * image)
+
+
+@given(rows=st.integers(1, 500), row_bytes=st.integers(1, 1 << 22), limit=st.integers(1, 1 << 22))
+def test_bands_fill_the_rows_and_keep_to_the_limit(rows, row_bytes, limit):
+    band = rows_per_band(rows, row_bytes, limit)
+    assert 1 <= band <= rows
+    assert band == 1 or band * row_bytes <= limit
+
+
+@pytest.mark.parametrize("output_stride", [16, 8])
+def test_the_decoder_takes_it_where_it_spares_products(output_stride, monkeypatch):
+    record = torch_architecture("mobilenet_v2", ["sand", "rock"], output_stride=output_stride)
+    weights = initial_weights(record, jax.random.key(0))
+    image = np.random.default_rng(0).integers(0, 256, (2, 49, 70, 3)).astype(np.uint8)
+    taken = []
+
+    def noticed(*arguments, **options):
+        taken.append(True)
+        return separable_on_upsampled(*arguments, **options)
+
+    monkeypatch.setattr(heads, "separable_on_upsampled", noticed)
+    plain, folded = pure_network(record, weights), pure_network(*fold_batch_norm(record, weights))
+    logits = np.asarray(jax.jit(plain.apply)(plain.weights, image))
+    assert not taken, "batch norms that may learn need all pixels at once"
+    result = jax.jit(folded.apply)(folded.weights, image)
+    assert bool(taken) == (output_stride == 16)
+    np.testing.assert_allclose(result, logits, atol=1e-4 * max(1.0, float(np.abs(logits).max())))
