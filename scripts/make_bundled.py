@@ -3,8 +3,8 @@
     python scripts/make_bundled.py --work DIR [--only model|traverse]
 
 Worlds are simulated (extra `sim`), their seeds below. Pictures of other worlds train the network, from scratch, by
-`jaxmap train --config rover`; a traverse through a world that it never saw becomes the sample. Takes hours on two cores,
-and goes on where it was interrupted.
+`jaxmap train --config rover`; a traverse through a world that it never saw becomes the sample. Takes about two hours on
+two cores, and goes on where it was interrupted.
 """
 
 from __future__ import annotations

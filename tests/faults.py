@@ -231,7 +231,6 @@ MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "class out of range": (1, labels(strange_label)),
     "label in colours": (1, labels(colour_label)),
     "probabilities over 1": (1, labels(wild_probabilities)),
-    "deeplab without a model": (2, with_words("--labeller", "deeplab")),
     "a model without deeplab": (2, with_words("--model", "model.safetensors")),
     "no such model": (1, with_words("--labeller", "deeplab", "--model", "nowhere.safetensors")),
     "a model that is none": (1, no_model),
