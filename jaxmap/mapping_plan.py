@@ -250,11 +250,10 @@ def _grid(
     """The grid that the settings ask for; voxels of no given size are as fine as the memory allows."""
     if config.grid.voxel_size_m is not None:
         return _grid_of(config.grid, config.grid.voxel_size_m, sequence, front_end, max_depth_m)
-    for voxel_size_m in DEFAULT_VOXELS_M:
-        grid = _grid_of(config.grid, voxel_size_m, sequence, front_end, max_depth_m)
-        if map_bytes(grid, class_count) <= config.grid.max_memory_gib * 2**30:
-            break
-    return grid
+    grids = (_grid_of(config.grid, size_m, sequence, front_end, max_depth_m) for size_m in DEFAULT_VOXELS_M)
+    limit_bytes = config.grid.max_memory_gib * 2**30
+    coarsest = _grid_of(config.grid, DEFAULT_VOXELS_M[-1], sequence, front_end, max_depth_m)
+    return next((grid for grid in grids if map_bytes(grid, class_count) <= limit_bytes), coarsest)
 
 
 def _grid_of(

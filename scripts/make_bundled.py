@@ -1,4 +1,4 @@
-"""Makes what comes with jaxmap: the sample traverse and the network for rovers on sand.
+"""Makes what comes with jaxmap anew: the sample traverse and the network for rovers on sand.
 
     python scripts/make_bundled.py --work DIR [--only model|traverse]
 
@@ -18,10 +18,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from jaxmap.models.checkpoint import load_network
-
 BUNDLED = Path(__file__).resolve().parents[1] / "jaxmap" / "bundled"
 LESSONS = {"--training": "268", "--seed": "5001", "--size": "384 512"}
+STAGES = {
+    "first": {},
+    "second": {"--epochs": "36", "--norm.backbone": "batch", "--norm.head": "batch"},
+}
+"""The network is trained, and once more from there with the rate at its start."""
 TRAVERSE = {"--scene": "few", "--seed": "101"}
 JPEG_QUALITY = 93
 """The sample's images are JPEG files in full colour resolution; as PNG files they would be five times as large."""
@@ -42,10 +45,13 @@ def main() -> None:
 def make_model(work: Path) -> None:
     """Renders the lessons, trains on them, and copies the model."""
     jaxmap("simulate", "--out", work / "lessons", *words(LESSONS))
-    run = work / "training"
-    jaxmap("train", work / "lessons", "--out", run, "--config", "rover", *(["--resume"] if run.exists() else []))
-    load_network(run / "model.safetensors")
-    shutil.copyfile(run / "model.safetensors", BUNDLED / "rover.safetensors")
+    start: list[str | Path] = []
+    for name, options in STAGES.items():
+        run = work / name
+        resume = ["--resume"] if run.exists() else []
+        jaxmap("train", work / "lessons", "--out", run, "--config", "rover", *start, *words(options), *resume)
+        start = ["--init", run / "model.safetensors"]
+    shutil.copyfile(start[1], BUNDLED / "rover.safetensors")
 
 
 def make_traverse(work: Path) -> None:

@@ -221,7 +221,7 @@ MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "even block": (2, with_words("--stereo.block-size", "4")),
     "matrix of another size": (2, with_yaml("fusion: {class_increments: [[1, 0], [0, 1]]}\n")),
     "penalties the wrong way round": (2, with_words("--stereo.p1", "9", "--stereo.p2", "3")),
-    "too large a map": (1, with_words("--grid.max-memory-gib", "1e-4")),
+    "too large a map": (1, with_words("--grid.max-memory-gib", "1e-4", "--grid.voxel-size-m", "0.1")),
     "bounds the wrong way round": (2, with_words("--grid.lower-m", "3", "0", "0")),
     "files without a folder": (2, with_words("--labeller", "files")),
     "no such folder of labels": (1, with_words("--labeller", "files", "--labels", "nowhere")),

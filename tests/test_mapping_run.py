@@ -20,9 +20,10 @@ from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import stored_fusion
+from jaxmap.geometry.bounds import map_bytes
 from jaxmap.map_store import load_map
 from jaxmap.mapping import run_plan
-from jaxmap.mapping_plan import Plan, plan_run
+from jaxmap.mapping_plan import DEFAULT_VOXELS_M, Plan, plan_run
 from jaxmap.run_folder import RunFolder
 from jaxmap.sequence import prepare_frames
 
@@ -82,7 +83,7 @@ def test_all_outputs_are_there_and_readable(finished_run):
     assert attributes.progress["complete"]
     assert len(read_ply(finished_run / "map.ply")) == len(voxels_of(finished_run).label) > 500
     with rasterio.open(finished_run / "bev.tif") as raster:
-        assert (raster.height, raster.width) == (52, 40)
+        assert (raster.height, raster.width) == (104, 80)
         np.testing.assert_allclose((raster.transform[2], raster.transform[5]), (-2.0, 5.2), atol=1e-6)
     for picture in [finished_run / "bev.png", *(finished_run / "pictures").iterdir()]:
         with Image.open(picture) as image:
@@ -205,9 +206,9 @@ def test_automatic_bounds_hold_the_scene_and_lie_on_whole_voxels(scene_folder):
 
 @pytest.mark.parametrize("fitting", range(len(DEFAULT_VOXELS_M)))
 def test_voxels_of_no_given_size_are_the_finest_that_fit(scene_folder, fitting):
-    fine = [planned(scene_folder, **{"grid.voxel_size_m": size}).grid for size in DEFAULT_VOXELS_M]
+    fine = [planned(scene_folder, grid={"voxel_size_m": list(size)}).grid for size in DEFAULT_VOXELS_M]
     limit_gib = map_bytes(fine[fitting], 3) / 2**30
-    plan = planned(scene_folder, **{"grid.max_memory_gib": limit_gib})
+    plan = planned(scene_folder, grid={"max_memory_gib": limit_gib})
     np.testing.assert_allclose(plan.grid.voxel_size_m, DEFAULT_VOXELS_M[fitting], atol=1e-6)
 
 

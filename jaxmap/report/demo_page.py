@@ -11,7 +11,7 @@ import rasterio
 from PIL import Image
 from rasterio.coords import BoundingBox
 from rasterio.errors import RasterioError
-from rasterio.windows import Window
+from rasterio.windows import from_bounds
 
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import occupied_voxels
@@ -93,9 +93,9 @@ def _cut(path: Path, bounds: BoundingBox) -> np.ndarray:
     """The part of a raster that lies within bounds of its system: (bands, H, W)."""
     try:
         with rasterio.open(path) as file:
-            whole = Window(0, 0, file.width, file.height)
-            window = file.window(*bounds).round_offsets().round_lengths().intersection(whole)
-            return file.read(window=window)
+            whole = from_bounds(*file.bounds, transform=file.transform)
+            part = from_bounds(*bounds, transform=file.transform).round_offsets().round_lengths()
+            return file.read(window=part.intersection(whole.round_offsets().round_lengths()))
     except RasterioError as error:
         raise JaxmapError("not a readable raster", where=path, fix="install jaxmap anew") from error
 
