@@ -28,8 +28,9 @@ class GridConfig:
 
     __pydantic_config__ = _STRICT
 
-    voxel_size_m: Positive | tuple[Positive, Positive, Positive] = 0.1
-    """Edge of a voxel, or three edges (x, y, z)."""
+    voxel_size_m: Positive | tuple[Positive, Positive, Positive] | None = None
+    """Edge of a voxel, or three edges (x, y, z). By default 0.05 0.05 0.2: columns finer than the cells that maps are
+    scored in, so that rocks are measured by area; or the next of 0.1 0.1 0.2 and 0.2 whose map fits the memory."""
     lower_m: Triple | None = None
     """Lower corner of the map, relative to the site origin; by default the poses and the range decide."""
     upper_m: Triple | None = None
@@ -177,7 +178,8 @@ class MapConfig:
     labeller: Literal["plane", "deeplab", "files", "none"] = "plane"
     """What labels the points: the MLESAC plane, a network, files of labels, or nothing."""
     model: Path | None = None
-    """Model file of the network, with the deeplab labeller; jaxmap weights import writes them."""
+    """Model file of the network, with the deeplab labeller (train and weights import write them); by default the
+    bundled one, for rovers on sand."""
     model_sha256: str | None = None
     """SHA-256 that the model file must have; the config.yaml of a run tells it."""
     labels: Path | None = None

@@ -21,6 +21,18 @@ def config_folder() -> Path:
     return packaged if packaged.is_dir() else Path(__file__).parents[1] / "configs"
 
 
+def bundled(name: str) -> Path:
+    """A file or folder of data that comes with jaxmap.
+
+    Raises:
+        JaxmapError: it is not there.
+    """
+    path = Path(__file__).parent / "bundled" / name
+    if not path.exists():
+        raise JaxmapError(f"{name} is missing", where=path.parent, fix="install jaxmap anew")
+    return path
+
+
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside `path`, which replaces it when the block ends well.

@@ -13,12 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxmap.config import MapConfig, split_fusion
+from jaxmap.config import GridConfig, MapConfig, Triple, split_fusion
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.files import bundled
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
@@ -33,6 +34,9 @@ from jaxmap.types import GridSpec, make_grid
 Tell = Callable[[str], None]
 
 _KEY_FRAMES = 4
+
+DEFAULT_VOXELS_M: tuple[Triple, ...] = ((0.05, 0.05, 0.2), (0.1, 0.1, 0.2), (0.2, 0.2, 0.2))
+"""The voxels of a map whose settings name none, the finest that fits."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,7 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         labeller = _labeller(config, label_folder, network)
         if model is not None and network is not None:
             tell(_told_network(model, network, labeller.classes))
-        grid = _grid(config, sequence, front_end, max_depth_m)
+        grid = _grid(config, sequence, front_end, max_depth_m, len(labeller.classes))
         params, rule = split_fusion(config.fusion, labeller.classes)
         fusion_rule = FusionRule(**rule)
         mapper_params = MapperParams(camera, make_fusion_params(labeller.classes, **params), labeller.params)
@@ -196,7 +200,7 @@ def _model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
 
     Raises:
         JaxmapError: the file cannot be read, or holds no whole network.
-        UsageError: there is no file, or it is not that which the settings tell.
+        UsageError: it is not the one that the settings tell.
     """
     if config.labeller != "deeplab":
         if config.model is not None:
@@ -205,20 +209,16 @@ def _model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
                 fix="add --labeller deeplab, or leave it out",
             )
         return None, None
-    if config.model is None:
-        raise UsageError(
-            "the deeplab labeller needs a network, and none comes with jaxmap yet",
-            fix="give --model F; jaxmap weights import makes one of a public checkpoint",
-        )
-    saved = load_network(config.model)
-    sha256 = hashlib.sha256(config.model.read_bytes()).hexdigest()
+    path = config.model or bundled("rover.safetensors")
+    saved = load_network(path)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     if config.model_sha256 is not None and config.model_sha256.lower() != sha256:
         raise UsageError(
             f"the model's SHA-256 does not start with {config.model_sha256[:16]}",
-            where=config.model,
+            where=path,
             fix="give the model of that run, or leave out model_sha256",
         )
-    return ModelFile(config.model, sha256), saved
+    return ModelFile(path, sha256), saved
 
 
 def _told_network(model: ModelFile, network: SavedModel, classes: Sequence[str]) -> str:
@@ -244,20 +244,37 @@ def _labeller(config: MapConfig, label_folder: LabelFolder | None, network: Save
     return make_no_labeller()
 
 
-def _grid(config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float) -> GridSpec:
-    settings = config.grid
+def _grid(
+    config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float, class_count: int
+) -> GridSpec:
+    """The grid that the settings ask for; voxels of no given size are as fine as the memory allows."""
+    if config.grid.voxel_size_m is not None:
+        return _grid_of(config.grid, config.grid.voxel_size_m, sequence, front_end, max_depth_m)
+    grids = (_grid_of(config.grid, size_m, sequence, front_end, max_depth_m) for size_m in DEFAULT_VOXELS_M)
+    limit_bytes = config.grid.max_memory_gib * 2**30
+    coarsest = _grid_of(config.grid, DEFAULT_VOXELS_M[-1], sequence, front_end, max_depth_m)
+    return next((grid for grid in grids if map_bytes(grid, class_count) <= limit_bytes), coarsest)
+
+
+def _grid_of(
+    settings: GridConfig,
+    voxel_size_m: float | Triple,
+    sequence: StereoSequence,
+    front_end: StereoFrontEnd,
+    max_depth_m: float,
+) -> GridSpec:
     views = grid_around_views(
         front_end.camera,
         sequence.T_world_camera @ front_end.T_raw_rectified,
         max_depth_m,
-        settings.voxel_size_m,
+        voxel_size_m,
         (settings.below_camera_m, settings.above_camera_m),
     )
     if (settings.lower_m is None) != (settings.upper_m is None):
         raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
     if settings.lower_m is None or settings.upper_m is None:
         return views
-    grid = make_grid(settings.lower_m, settings.upper_m, settings.voxel_size_m)
+    grid = make_grid(settings.lower_m, settings.upper_m, voxel_size_m)
     lower, upper = _extent(views)
     if (np.array(settings.lower_m) >= upper).any() or (np.array(settings.upper_m) <= lower).any():
         raise UsageError(

@@ -18,6 +18,7 @@ import pytest
 from faults import MAP_FAULTS, nan_pose, truncated
 from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from network_faults import IMPORT_FAULTS, SEGMENT_FAULTS, segment_words, write_inputs
+from training_data import CLASSES, TRAIN_FAULTS, write_data
 
 import jaxmap
 
@@ -101,6 +102,33 @@ def test_a_fault_of_weights_is_one_line(name, tmp_path, cli, told):
     assert len(outcome.error) < 600
     compare(name, f"{outcome.status} {outcome.error}", tmp_path, told)
     assert files_of(tmp_path) == before, "nothing is written and no input is touched"
+
+
+@pytest.mark.parametrize("name", TRAIN_FAULTS)
+def test_a_fault_of_train_is_one_line(name, tmp_path, cli, told, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    data = write_data(tmp_path / "data")
+    expected, spoil = TRAIN_FAULTS[name]
+    words = spoil(data, tmp_path) or []
+    before = files_of(tmp_path)
+    classes = () if "--classes" in words or "--config" in words else ("--classes", *CLASSES)
+    outcome = cli("train", data, "--out", tmp_path / "run", *classes, *words)
+    assert outcome.status == expected, outcome
+    assert "fault of jaxmap" not in outcome.error
+    assert len(outcome.error) < 400
+    assert ";" in outcome.error, "says what to do"
+    compare(f"train: {name}", f"{outcome.status} {outcome.error}", tmp_path, told)
+    assert files_of(tmp_path) == before, "nothing is written and no input is touched"
+
+
+def test_a_batch_that_the_devices_cannot_share_is_one_line(tmp_path, cli, told, monkeypatch):
+    import jax
+
+    monkeypatch.setattr(jax, "local_device_count", lambda: 3)
+    data = write_data(tmp_path / "data")
+    outcome = cli("train", data, "--out", tmp_path / "run", "--classes", *CLASSES, "--batch-size", "8")
+    assert outcome.status == 2
+    compare("train: batch not shared by the devices", f"{outcome.status} {outcome.error}", tmp_path, told)
 
 
 def faulty_command(name: str, tmp_path: Path, finished: Path) -> tuple[int, list[str]]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scenes import BASELINE_M, CX_PX, CY_PX, F_PX, HEIGHT_PX, WIDTH_PX, scene_frame
 from strategies import rngs
 
-from jaxmap.evaluation.geometry_scores import depth_consistency, point_range_error, score_disparity, score_surface
+from jaxmap.evaluation.geometry_scores import depth_consistency, point_range_error, score_disparity
 from jaxmap.types import make_stereo_camera
 
 CAMERA = make_stereo_camera(
@@ -104,34 +104,3 @@ def test_points_without_a_counterpart_are_left_out():
     half[:, : WIDTH_PX // 2] = np.nan
     known = np.isfinite(half) & (half > 0)
     assert len(depth_consistency(CAMERA, truth, half, jaxlie.SE3.identity())) == known.sum()
-
-
-volumes = st.builds(lambda rng, share: rng.random((6, 7, 5)) < share, rngs(), st.floats(0.01, 0.3))
-
-
-@given(volumes)
-def test_a_surface_against_itself_is_perfect(volume):
-    assert score_surface(volume, volume) == ((1.0, 1.0) if volume.any() else (0.0, 0.0))
-
-
-@given(volumes, volumes)
-def test_precision_and_recall_change_places_with_the_surfaces(mapped, true):
-    one, other = score_surface(mapped, true), score_surface(true, mapped)
-    assert (one.precision, one.recall) == (other.recall, other.precision)
-    assert 0 <= one.precision <= 1 and 0 <= one.recall <= 1
-
-
-@given(volumes, st.tuples(*[st.integers(-1, 1)] * 3))
-def test_one_voxel_off_is_forgiven_and_two_are_not(volume, shift):
-    padded = np.pad(volume, 3)
-    assert set(score_surface(np.roll(padded, shift, (0, 1, 2)), padded)) <= {1.0, 0.0}
-    single = np.zeros((9, 9, 9), bool)
-    single[4, 4, 4] = True
-    assert score_surface(np.roll(single, shift, (0, 1, 2)), single) == (1.0, 1.0)
-    assert score_surface(np.roll(single, 2, 0), single) == (0.0, 0.0)
-
-
-@given(volumes, volumes)
-def test_more_true_surface_never_lowers_precision(mapped, true):
-    more = true | np.roll(true, 1, 0)
-    assert score_surface(mapped, more).precision >= score_surface(mapped, true).precision

@@ -20,9 +20,10 @@ from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import stored_fusion
+from jaxmap.geometry.bounds import map_bytes
 from jaxmap.map_store import load_map
 from jaxmap.mapping import run_plan
-from jaxmap.mapping_plan import Plan, plan_run
+from jaxmap.mapping_plan import DEFAULT_VOXELS_M, Plan, plan_run
 from jaxmap.run_folder import RunFolder
 from jaxmap.sequence import prepare_frames
 
@@ -76,13 +77,13 @@ def test_all_outputs_are_there_and_readable(finished_run):
     assert not [path for path in finished_run.iterdir() if path.name.startswith(".")], "no leftovers"
     voxel_map, attributes = load_map(finished_run / "map.zarr")
     assert voxel_map.classes == ("background", "sand", "rock")
-    assert voxel_map.log_odds.shape == (4, 40, 52, 15)
+    assert voxel_map.log_odds.shape == (4, 80, 104, 8)
     assert int(voxel_map.frames_fused) == FRAMES
     assert attributes.crs is None
     assert attributes.progress["complete"]
     assert len(read_ply(finished_run / "map.ply")) == len(voxels_of(finished_run).label) > 500
     with rasterio.open(finished_run / "bev.tif") as raster:
-        assert (raster.height, raster.width) == (52, 40)
+        assert (raster.height, raster.width) == (104, 80)
         np.testing.assert_allclose((raster.transform[2], raster.transform[5]), (-2.0, 5.2), atol=1e-6)
     for picture in [finished_run / "bev.png", *(finished_run / "pictures").iterdir()]:
         with Image.open(picture) as image:
@@ -178,7 +179,7 @@ def test_raw_and_rectified_labels_are_one_where_the_images_are_rectified(scene_f
 def test_without_a_labeller_there_is_geometry_alone(cli, scene_folder, finished_run, tmp_path):
     assert cli(*map_words(scene_folder, tmp_path / "run", "--labeller", "none")).status == 0
     evidence = log_odds(tmp_path / "run")
-    assert evidence.shape == (1, 40, 52, 15)
+    assert evidence.shape == (1, 80, 104, 8)
     # The plane labeller leaves out what lies more than 2 m from the plane: nothing within these bounds.
     np.testing.assert_allclose(evidence[0], log_odds(finished_run)[0], atol=1e-4)
     assert all((tmp_path / "run" / name).exists() for name in OUTPUTS)
@@ -195,10 +196,20 @@ def test_automatic_bounds_hold_the_scene_and_lie_on_whole_voxels(scene_folder):
     config = config_tree(MapConfig())
     plan = plan_run(str(scene_folder), check_config(config), lambda line: None)
     origin = np.asarray(plan.grid.origin_m, np.float64)
-    np.testing.assert_allclose(origin / 0.1, np.rint(origin / 0.1), atol=1e-4)
-    upper = origin + np.array(plan.grid.shape) * 0.1
+    voxel_size_m = np.array(DEFAULT_VOXELS_M[0])
+    np.testing.assert_allclose(plan.grid.voxel_size_m, voxel_size_m, atol=1e-6)
+    np.testing.assert_allclose(origin / voxel_size_m, np.rint(origin / voxel_size_m), atol=1e-4)
+    upper = origin + np.array(plan.grid.shape) * voxel_size_m
     assert (origin <= BOXES_M[:, 0].min(axis=0)).all() and (upper >= BOXES_M[:, 1].max(axis=0)).all()
     assert plan.depth_range_m == (0.3, 4.0)
+
+
+@pytest.mark.parametrize("fitting", range(len(DEFAULT_VOXELS_M)))
+def test_voxels_of_no_given_size_are_the_finest_that_fit(scene_folder, fitting):
+    fine = [planned(scene_folder, grid={"voxel_size_m": list(size)}).grid for size in DEFAULT_VOXELS_M]
+    limit_gib = map_bytes(fine[fitting], 3) / 2**30
+    plan = planned(scene_folder, grid={"max_memory_gib": limit_gib})
+    np.testing.assert_allclose(plan.grid.voxel_size_m, DEFAULT_VOXELS_M[fitting], atol=1e-6)
 
 
 def test_the_paper_preset_and_an_override(cli, scene_folder, tmp_path):

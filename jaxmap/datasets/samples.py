@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ from jaxtyping import Float32
 from jaxmap.datasets.assemble import ReadOptions, assemble
 from jaxmap.datasets.base import FrameRef, StereoSequence
 from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.katwijk import open_katwijk
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.datasets.poses import make_pose_track
 from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.files import bundled
 from jaxmap.types import make_stereo_camera
 
 
@@ -75,5 +78,19 @@ def _motorcycle_file(name: str) -> Path:
     return path
 
 
-SAMPLES: dict[str, Callable[[ReadOptions], StereoSequence]] = {"motorcycle": _open_motorcycle}
+def sample_truth() -> Path:
+    """The ground truth of `sample:traverse`: labels, orthomosaic, heights and poses."""
+    return bundled("traverse/gt")
+
+
+def _open_traverse(options: ReadOptions) -> StereoSequence:
+    """A drive through a simulated world in the Katwijk layout (`scripts/make_bundled.py`); poses are estimated."""
+    sequence = open_katwijk(bundled("traverse/Part1"), options)
+    return replace(sequence, name="traverse")
+
+
+SAMPLES: dict[str, Callable[[ReadOptions], StereoSequence]] = {
+    "motorcycle": _open_motorcycle,
+    "traverse": _open_traverse,
+}
 """The openers of the bundled sequences, by name."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxmap.geometry.camera import disparity_to_points, points_to_pixels, transform_points
 from jaxmap.types import StereoCamera
@@ -89,21 +89,3 @@ def depth_consistency(
     predicted_m = np.asarray(points_b)[landed][seen, 2]
     measured_m = measured[rows, columns, 2][seen]
     return (predicted_m - measured_m) / measured_m
-
-
-class SurfaceScores(NamedTuple):
-    """A surface of voxels against the true one, each allowed to be off by one voxel."""
-
-    precision: float
-    recall: float
-
-
-def score_surface(mapped: Bool[np.ndarray, "X Y Z"], true: Bool[np.ndarray, "X Y Z"]) -> SurfaceScores:
-    """The share of mapped voxels on the true surface, and of true ones on the mapped surface."""
-    from scipy.ndimage import binary_dilation
-
-    neighbours = np.ones((3, 3, 3), bool)
-    return SurfaceScores(
-        precision=float((mapped & binary_dilation(true, neighbours)).sum() / max(mapped.sum(), 1)),
-        recall=float((true & binary_dilation(mapped, neighbours)).sum() / max(true.sum(), 1)),
-    )

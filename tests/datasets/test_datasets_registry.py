@@ -312,7 +312,7 @@ def test_the_motorcycles_true_disparity_maps_left_to_right():
 
 
 def test_unknown_samples_are_told(tmp_path):
-    assert refused("sample:vespa") == "there is no sample 'vespa'; choose motorcycle"
+    assert refused("sample:vespa") == "there is no sample 'vespa'; choose motorcycle, traverse"
     message = refused("sample:motorcycle", ReadOptions(dataset="kitti"), UsageError)
     assert message == "a sample is not read as kitti in --dataset; leave the option out"
     write_tum(tmp_path / "late.tum", np.array([5.0]), track_of(1))

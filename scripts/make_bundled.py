@@ -1,0 +1,103 @@
+"""Makes what comes with jaxmap anew: the sample traverse and the network for rovers on sand.
+
+    python scripts/make_bundled.py --work DIR [--only model|traverse]
+
+Worlds are simulated (extra `sim`), their seeds below. Pictures of other worlds train the network, from scratch, by
+`jaxmap train --config rover`; a traverse through a world that it never saw becomes the sample. Takes about two hours on
+two cores, and goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+BUNDLED = Path(__file__).resolve().parents[1] / "jaxmap" / "bundled"
+LESSONS = {"--training": "268", "--seed": "5001", "--size": "384 512"}
+STAGES = {
+    "first": {},
+    "second": {"--epochs": "36", "--norm.backbone": "batch", "--norm.head": "batch"},
+}
+"""The network is trained, and once more from there with the rate at its start."""
+TRAVERSE = {"--scene": "few", "--seed": "101"}
+JPEG_QUALITY = 93
+"""The sample's images are JPEG files in full colour resolution; as PNG files they would be five times as large."""
+
+
+def main() -> None:
+    """Makes both, or one."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True, help="folder for what is made on the way")
+    parser.add_argument("--only", choices=("model", "traverse"))
+    given = parser.parse_args()
+    if given.only != "traverse":
+        make_model(given.work)
+    if given.only != "model":
+        make_traverse(given.work)
+
+
+def make_model(work: Path) -> None:
+    """Renders the lessons, trains on them, and copies the model."""
+    jaxmap("simulate", "--out", work / "lessons", *words(LESSONS))
+    start: list[str | Path] = []
+    for name, options in STAGES.items():
+        run = work / name
+        resume = ["--resume"] if run.exists() else []
+        jaxmap("train", work / "lessons", "--out", run, "--config", "rover", *start, *words(options), *resume)
+        start = ["--init", run / "model.safetensors"]
+    shutil.copyfile(start[1], BUNDLED / "rover.safetensors")
+
+
+def make_traverse(work: Path) -> None:
+    """Renders the traverse, and keeps what the demo and its readers need."""
+    source, target = work / "traverse", BUNDLED / "traverse"
+    jaxmap("simulate", "--out", source, *words(TRAVERSE))
+    shutil.rmtree(target, ignore_errors=True)
+    (target / "Part1" / "LocCam").mkdir(parents=True)
+    (target / "gt" / "labels").mkdir(parents=True)
+    for path in sorted((source / "Part1").glob("*.txt")):
+        shutil.copyfile(path, target / "Part1" / path.name)
+    for path in sorted((source / "Part1" / "LocCam").glob("*.png")):
+        with Image.open(path) as image:
+            image.save(target / "Part1" / "LocCam" / f"{path.stem}.jpg", quality=JPEG_QUALITY, subsampling=0)
+    for path in sorted((source / "gt" / "labels").glob("*.png")):
+        shutil.copyfile(path, target / "gt" / "labels" / path.name)
+    shutil.copyfile(source / "gt" / "poses_utm.tum", target / "gt" / "poses_utm.tum")
+    copy_rasters(source / "gt", target / "gt")
+    size_mib = sum(path.stat().st_size for path in target.rglob("*") if path.is_file()) / 2**20
+    print(f"{target}: {size_mib:.1f} MiB")
+
+
+def copy_rasters(source: Path, target: Path) -> None:
+    """The labelled orthomosaic as it is; the picture with JPEG compression."""
+    import rasterio
+
+    shutil.copyfile(source / "orthomosaic_labels.tif", target / "orthomosaic_labels.tif")
+    with rasterio.open(source / "orthomosaic.tif") as file:
+        pixels, profile = file.read(), file.profile
+    profile.pop("predictor", None)
+    profile.update(compress="jpeg", photometric="ycbcr", jpeg_quality=85, interleave="pixel", tiled=True)
+    profile.update(blockxsize=256, blockysize=256)
+    with rasterio.open(target / "orthomosaic.tif", "w", **profile) as file:
+        file.write(np.asarray(pixels))
+
+
+def words(options: dict[str, str]) -> list[str]:
+    """Options as words of a command line."""
+    return [word for name, value in options.items() for word in (name, *value.split())]
+
+
+def jaxmap(*command: str | Path) -> None:
+    """Runs a command of jaxmap's; stops where it fails."""
+    if status := subprocess.run([sys.executable, "-m", "jaxmap", *map(str, command)]).returncode:
+        raise SystemExit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""The demo: the paper's table on the bundled traverse, and what comes bundled."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from fixtures import shared_cache  # noqa: F401
+
+from jaxmap.cli import main
+from jaxmap.datasets import ReadOptions, open_sequence
+from jaxmap.datasets.pose_files import read_poses
+from jaxmap.datasets.samples import sample_truth
+from jaxmap.files import bundled
+from jaxmap.labels import ROVER_CLASSES
+from jaxmap.models.checkpoint import load_network
+
+MIB = 2**20
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory, shared_cache):
+    out = tmp_path_factory.mktemp("demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAXMAP_CACHE", str(shared_cache))
+        assert main(["demo", "--out", str(out)]) == 0
+    return out
+
+
+def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
+    rows = json.loads((demo / "table.json").read_text())
+    assert [(row["labeller"], row["preset"]) for row in rows] == [
+        (labeller, preset) for labeller in ("plane", "deeplab") for preset in ("chiodini2020", "default")
+    ]
+    for row in rows:
+        assert row["accuracy"] == (row["tp"] + row["tn"]) / (row["tp"] + row["tn"] + row["fp"] + row["fn"])
+        assert row["iou"] == row["tp"] / (row["tp"] + row["fp"] + row["fn"])
+        assert row["frames_per_s"] > 0 and row["peak_resident_mib"] < 4096
+        assert (demo / row["run"] / "report.html").stat().st_size > 10_000
+
+
+def test_the_network_beats_the_plane_and_our_rule_the_paper_s(demo):
+    scores = {(row["labeller"], row["preset"]): row for row in json.loads((demo / "table.json").read_text())}
+    best = scores["deeplab", "default"]
+    assert best["iou"] > scores["plane", "default"]["iou"] and best["iou"] > scores["deeplab", "chiodini2020"]["iou"]
+    assert best["accuracy"] > 0.95
+
+
+def test_the_report_shows_images_truth_maps_and_errors(demo):
+    text = (demo / "report.html").read_text("utf-8")
+    for caption in ("Left image", "Labels", "Ground truth", "Map from above: deeplab, default", "Errors: plane"):
+        assert caption in text
+    assert (demo / "truth.png").stat().st_size > 1000 and (demo / "orthomosaic.png").stat().st_size > 1000
+
+
+def test_the_bundled_network_is_small_and_knows_the_rover_s_classes():
+    path = bundled("rover.safetensors")
+    assert path.stat().st_size < 10 * MIB
+    model = load_network(path)
+    assert model.architecture.classes == ROVER_CLASSES and model.architecture.backbone == "mobilenet_v2"
+
+
+def test_the_sample_is_small_and_whole():
+    files = [path for path in bundled("traverse").rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 15 * MIB
+    sequence = open_sequence("sample:traverse", ReadOptions())
+    assert len(sequence.frames) >= 12 and sequence.crs == "EPSG:32631"
+    with rasterio.open(sample_truth() / "orthomosaic_labels.tif") as file:
+        assert file.crs.to_epsg() == 32631 and set(np.unique(file.read(1))) == {0, 1, 2}
+
+
+def test_the_sample_s_estimated_poses_are_near_the_true_ones():
+    sequence = open_sequence("sample:traverse", ReadOptions())
+    true = read_poses(sample_truth() / "poses_utm.tum").T
+    off_m = np.linalg.norm(sequence.T_world_camera[:, :3, 3] + sequence.site_origin - true[:, :3, 3], axis=1)
+    assert off_m.max() < 0.05
