@@ -37,7 +37,7 @@ def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
     for row in rows:
         assert row["accuracy"] == (row["tp"] + row["tn"]) / (row["tp"] + row["tn"] + row["fp"] + row["fn"])
         assert row["iou"] == row["tp"] / (row["tp"] + row["fp"] + row["fn"])
-        assert row["frames_per_s"] > 0 and row["peak_resident_mib"] < 4096
+        assert row["frames_per_s"] > 0
         assert (demo / row["run"] / "report.html").stat().st_size > 10_000
 
 

@@ -248,9 +248,14 @@ def test_an_interrupt_is_one_line_and_says_how_to_go_on(number, cli, plan, tiny_
             os.kill(os.getpid(), number)
 
     run = tmp_path / "run"
-    with monkeypatch.context() as patched:
-        patched.setattr(TrainingRun, "_check_finite", interrupted)
-        outcome = cli(*train_words(tiny_data, run))
+    # A shell in the background starts its children with interrupts ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with monkeypatch.context() as patched:
+            patched.setattr(TrainingRun, "_check_finite", interrupted)
+            outcome = cli(*train_words(tiny_data, run))
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert outcome.status == 130 and outcome.error == "interrupted"
     assert "interrupted in epoch 2 of 3, which --resume begins again" in outcome.err
     assert "Interrupted in epoch 2 of 3." in (run / "report.html").read_text()
