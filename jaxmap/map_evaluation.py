@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float64
 
 import jaxmap
 from jaxmap.datasets.crs import Extent, crs_text, read_crs
@@ -22,12 +23,13 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.evaluate import ClassMap, Evaluation, ScoringOptions, evaluate_map
 from jaxmap.evaluation.truth_cells import PixelCorners, pixel_corners, sample_between
 from jaxmap.evaluation.views import Views
-from jaxmap.fusion.params import stored_fusion
+from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
 from jaxmap.fusion.query import top_down
 from jaxmap.map_store import load_map
 from jaxmap.output_folder import write_json
 from jaxmap.report.error_map import write_error_map
 from jaxmap.run_folder import RunFolder
+from jaxmap.types import VoxelMap
 
 _MARGIN_M, _MARGIN_SHARE = 3.0, 0.05
 _BACKDROP_SAMPLES = 8
@@ -65,6 +67,30 @@ def read_class_map(run: Path, target: str) -> ClassMap:
         known = f"its classes are {' '.join(voxel_map.classes)}" if voxel_map.classes else "it has no class at all"
         raise UsageError(f"the map has no class {target!r}: {known}", where=folder.map, fix="name one with --class")
     params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
+    return class_map_of(
+        voxel_map, params, rule, target, site_origin=np.asarray(attributes.site_origin, np.float64), crs=attributes.crs
+    )
+
+
+def class_map_of(
+    voxel_map: VoxelMap,
+    params: FusionParams,
+    rule: FusionRule,
+    target: str,
+    *,
+    site_origin: Float64[np.ndarray, "3"],
+    crs: str | None,
+) -> ClassMap:
+    """A map from above, as `target`, one of its classes, is scored in it.
+
+    Args:
+        voxel_map: the map.
+        params: how its evidence is read, with `rule`.
+        rule: see `params`.
+        target: name of the class.
+        site_origin: where the origin of the map's world lies in `crs`, metres.
+        crs: coordinate reference system of the site, or None.
+    """
     top = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
     index = voxel_map.classes.index(target)
     return ClassMap(
@@ -74,8 +100,8 @@ def read_class_map(run: Path, target: str) -> ClassMap:
         observed=top.observed,
         height_m=top.height_m,
         prior=float(jax.nn.sigmoid(params.class_prior[index])),
-        site_origin=np.asarray(attributes.site_origin, np.float64),
-        crs=attributes.crs,
+        site_origin=site_origin,
+        crs=crs,
     )
 
 

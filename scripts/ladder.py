@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from jaxmap.cache import keep_compiled_programs
@@ -25,8 +24,7 @@ from jaxmap.evaluation.cells import CellGrid, column_shares, make_cells, map_cel
 from jaxmap.evaluation.evaluate import ClassMap
 from jaxmap.evaluation.map_scores import Confusion, confusion_scores, count_confusion
 from jaxmap.evaluation.truth_cells import truth_cells
-from jaxmap.fusion.query import top_down
-from jaxmap.map_evaluation import TruthOptions, read_truth
+from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
 from jaxmap.mapping_plan import Plan, plan_run
 from jaxmap.sequence import PreparedFrame, prepare_frames, run_sequence
 
@@ -59,16 +57,9 @@ def fused(plan: Plan, frames: list[PreparedFrame], target: str) -> ClassMap:
     # The step is compiled for each rule; the frames are the same.
     steps = run_sequence(plan.mapper, plan.mapper.init(), frames, plan.params, plan.key)
     voxel_map, _ = deque(steps, maxlen=1).pop()
-    top = jax.tree.map(np.asarray, top_down(voxel_map, plan.params.fusion, plan.rule))
-    index = plan.labeller.classes.index(target)
-    return ClassMap(
-        grid=voxel_map.grid,
-        is_class=(top.label == index) & top.observed,
-        probability=top.probability[index],
-        observed=top.observed,
-        height_m=top.height_m,
-        site_origin=plan.sequence.site_origin,
-        crs=plan.sequence.crs,
+    sequence = plan.sequence
+    return class_map_of(
+        voxel_map, plan.params.fusion, plan.rule, target, site_origin=sequence.site_origin, crs=sequence.crs
     )
 
 

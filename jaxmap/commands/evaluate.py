@@ -11,6 +11,7 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.report.wording import SCORE_COLUMNS
 
 
 @dataclass(frozen=True)
@@ -53,22 +54,7 @@ class EvaluateArguments:
     """An RGB orthomosaic to draw the errors on."""
 
 
-COLUMNS = {
-    "over": "counted",
-    "accuracy": "accuracy",
-    "iou": "IoU",
-    "precision": "precision",
-    "recall": "recall",
-    "f1": "F1",
-    "coverage": "coverage",
-    "tp": "TP",
-    "fp": "FP",
-    "fn": "FN",
-    "tn": "TN",
-    "nll": "NLL",
-    "brier": "Brier",
-    "ece": "ECE",
-}
+COLUMNS = {"over": "counted", **SCORE_COLUMNS}
 
 
 def main(words: Sequence[str]) -> int:

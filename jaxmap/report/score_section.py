@@ -9,23 +9,7 @@ from typing import Any
 
 from jaxmap.errors import JaxmapError
 from jaxmap.report.inline import inline_image
-from jaxmap.report.wording import value_text
-
-_COLUMNS = {
-    "accuracy": "accuracy",
-    "iou": "IoU",
-    "precision": "precision",
-    "recall": "recall",
-    "f1": "F1",
-    "coverage": "coverage",
-    "tp": "TP",
-    "fp": "FP",
-    "fn": "FN",
-    "tn": "TN",
-    "nll": "NLL",
-    "brier": "Brier",
-    "ece": "ECE",
-}
+from jaxmap.report.wording import SCORE_COLUMNS, value_text
 
 
 def score_section(run: Path, remarks: list[str]) -> str:
@@ -45,13 +29,13 @@ def score_section(run: Path, remarks: list[str]) -> str:
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         remarks.append(f"{path.name} could not be read: the scores are left out.")
         return ""
-    head = "".join(f'<th scope="col">{name}</th>' for name in ("Counted", *_COLUMNS.values()))
+    head = "".join(f'<th scope="col">{name}</th>' for name in ("Counted", *SCORE_COLUMNS.values()))
     table = f'<div class="list"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     return f"<section><h2>Against ground truth</h2><p>{_basis(scores)}</p>{table}{_picture(run, remarks)}</section>"
 
 
 def _row(name: str, values: dict[str, Any]) -> str:
-    cells = "".join(f"<td>{value_text(values.get(key))}</td>" for key in _COLUMNS)
+    cells = "".join(f"<td>{value_text(values.get(key))}</td>" for key in SCORE_COLUMNS)
     return f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>'
 
 

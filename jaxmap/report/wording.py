@@ -17,6 +17,23 @@ _NAMES = {
     "crs": "Coordinate reference system",
 }
 
+SCORE_COLUMNS = {
+    "accuracy": "accuracy",
+    "iou": "IoU",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+    "coverage": "coverage",
+    "tp": "TP",
+    "fp": "FP",
+    "fn": "FN",
+    "tn": "TN",
+    "nll": "NLL",
+    "brier": "Brier",
+    "ece": "ECE",
+}
+"""Headings of the scores of a map, by their keys (DESIGN: Scores JSON)."""
+
 
 def name_and_unit(key: str) -> tuple[str, str]:
     """What a key says: `peak_resident_mib` is "Peak resident" in "MiB"."""
