@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import rasterio
 from fixtures import shared_cache  # noqa: F401
 
-from jaxmap.cli import main
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.datasets.samples import sample_truth
@@ -23,9 +25,9 @@ MIB = 2**20
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory, shared_cache):
     out = tmp_path_factory.mktemp("demo")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAXMAP_CACHE", str(shared_cache))
-        assert main(["demo", "--out", str(out)]) == 0
+    # In a process of its own, so that the memory it tells is its own.
+    environment = {**os.environ, "JAXMAP_CACHE": str(shared_cache)}
+    subprocess.run([sys.executable, "-m", "jaxmap", "demo", "--out", str(out)], env=environment, check=True)
     return out
 
 
@@ -37,7 +39,7 @@ def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
     for row in rows:
         assert row["accuracy"] == (row["tp"] + row["tn"]) / (row["tp"] + row["tn"] + row["fp"] + row["fn"])
         assert row["iou"] == row["tp"] / (row["tp"] + row["fp"] + row["fn"])
-        assert row["frames_per_s"] > 0
+        assert row["frames_per_s"] > 0 and row["peak_resident_mib"] < 4096
         assert (demo / row["run"] / "report.html").stat().st_size > 10_000
 
 
