@@ -1,10 +1,12 @@
-"""How the process is given its memory: in large pages, and for good, where it uses gigabytes for seconds at a time."""
+"""The memory of the process: how it is given (in large pages, and for good, for long work), and how much it took."""
 
 from __future__ import annotations
 
 import os
 import platform
+import resource
 import sys
+from pathlib import Path
 
 _TUNABLES = "GLIBC_TUNABLES"
 _SETTINGS = {
@@ -32,6 +34,21 @@ def restart_with_lasting_memory() -> None:
     settings = ":".join([*filter(None, [settings]), *(f"{name}={value}" for name, value in _SETTINGS.items())])
     sys.stdout.flush()
     os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, _TUNABLES: settings})
+
+
+def peak_resident_mib() -> float:
+    """The greatest resident size of this program so far.
+
+    Linux tells it of the program itself. `getrusage`, which every Unix has, also counts the process that started it.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name == "VmHWM":
+                return int(value.split()[0]) / 2**10
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _understood() -> bool:

@@ -10,11 +10,12 @@ import numpy as np
 
 import jaxmap
 from jaxmap.errors import JaxmapError
+from jaxmap.host_memory import peak_resident_mib
 from jaxmap.map_store import MapAttributes, save_map
 from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json
 from jaxmap.report.html import write_report
-from jaxmap.run_folder import RunFolder, RunLog, peak_resident_mib
+from jaxmap.run_folder import RunFolder, RunLog
 from jaxmap.run_outputs import count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.types import VoxelMap

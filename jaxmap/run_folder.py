@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import resource
 import shutil
-import sys
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -188,9 +186,3 @@ class RunFolder:
         for picture in self.pictures.glob("*.png"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 picture.unlink()
-
-
-def peak_resident_mib() -> float:
-    """The greatest resident size of this process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)

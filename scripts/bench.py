@@ -32,6 +32,7 @@ from jaxmap.datasets.pose_files import write_tum
 from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD
 from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.host_memory import peak_resident_mib
 from jaxmap.labellers import Labeller, make_no_labeller, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapper import Mapper, MapperParams, StepCost, compile_step, make_mapper
@@ -39,7 +40,6 @@ from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import fold_batch_norm, initial_weights, pure_network
 from jaxmap.output_folder import write_json
-from jaxmap.run_folder import peak_resident_mib
 from jaxmap.sequence import prepare_frames, run_sequence
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions

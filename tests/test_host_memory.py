@@ -83,3 +83,15 @@ def test_a_process_restarts_once_and_keeps_number_and_arguments():
 def test_memory_that_was_freed_is_not_fetched_again():
     # Fetched anew, each of the four arrays would take 20 pages of 2 MiB or 10,000 of 4 KiB.
     assert int(run(WORK)) < 20
+
+
+PEAK = "from jaxmap.host_memory import peak_resident_mib; print(peak_resident_mib())"
+
+
+def test_the_peak_is_that_of_the_program_not_of_the_one_that_started_it():
+    large = f"import subprocess, sys; kept = b'x' * (600 << 20); subprocess.run([sys.executable, '-c', {PEAK!r}])"
+    told = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+        for code in (PEAK, large)
+    ]
+    assert 0.8 < told[1] / told[0] < 1.25
