@@ -33,17 +33,55 @@ class View(NamedTuple):
     mirrored: Bool[Array, ""]
 
 
-def draw_view(key: PRNGKeyArray, size_px: Int[Array, "2"], options: AugmentationOptions) -> View:
+def draw_view(
+    key: PRNGKeyArray, labels: UInt8[Array, "H W"], size_px: Int[Array, "2"], options: AugmentationOptions
+) -> View:
     """A random crop of an image of `size_px` (height, width).
 
-    Where the scaled image is smaller than the crop, it lies somewhere within it.
+    Where the scaled image is smaller than the crop, it lies somewhere within it. `options.class_share` of the crops are
+    drawn so that a pixel of a class lies somewhere in them, each class of the image as often as the others: large
+    crops show little of what is rare.
     """
     scale_key, offset_key, mirror_key = jax.random.split(key, 3)
     scale = jax.random.uniform(scale_key, minval=options.scale[0], maxval=options.scale[1])
-    spare_px = jnp.floor(size_px * scale).astype(jnp.int32) - jnp.array(options.crop_px)
+    crop_px = jnp.array(options.crop_px)
+    spare_px = jnp.floor(size_px * scale).astype(jnp.int32) - crop_px
     low, high = jnp.minimum(spare_px, 0), jnp.maximum(spare_px, 0)
     offset_px = jax.random.randint(offset_key, (2,), low, high + 1)
-    return View(scale, offset_px, jax.random.bernoulli(mirror_key) & options.mirror)
+    mirrored = jax.random.bernoulli(mirror_key) & options.mirror
+    if options.class_share:
+        chosen_key, pixel_key, place_key = jax.random.split(jax.random.fold_in(key, 1), 3)
+        row, column = draw_pixel(pixel_key, labels, size_px)
+        pixel = jnp.stack([row, jnp.where(mirrored, size_px[1] - 1 - column, column)])
+        place = jax.random.randint(place_key, (2,), 0, crop_px)
+        around = jnp.clip(jnp.floor((pixel + 0.5) * scale).astype(jnp.int32) - place, low, high)
+        offset_px = jnp.where(jax.random.bernoulli(chosen_key, options.class_share), around, offset_px)
+    return View(scale, offset_px, mirrored)
+
+
+def draw_pixel(
+    key: PRNGKeyArray, labels: UInt8[Array, "H W"], size_px: Int[Array, "2"]
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Row and column of a random pixel of a random class, of those that an image of `size_px` holds.
+
+    (0, 0) where it holds none.
+    """
+    class_key, row_key, column_key = jax.random.split(key, 3)
+    rows, columns = (jnp.arange(count) for count in labels.shape)
+    labels = jnp.where((rows < size_px[0])[:, None] & (columns < size_px[1]), labels, IGNORE)
+    present = jnp.zeros(256, bool).at[labels.reshape(-1)].set(True).at[IGNORE].set(False)
+    chosen = _draw_place(class_key, present)
+    row = _draw_place(row_key, (labels == chosen).sum(axis=1))
+    column = _draw_place(column_key, labels[row] == chosen)
+    found = present.any()
+    return jnp.where(found, row, 0), jnp.where(found, column, 0)
+
+
+def _draw_place(key: PRNGKeyArray, counts: Int[Array, "N"] | Bool[Array, "N"]) -> Int[Array, ""]:
+    """A place, each as likely as its count tells."""
+    reached = jnp.cumsum(counts.astype(jnp.int32))
+    drawn = jax.random.randint(key, (), 0, jnp.maximum(reached[-1], 1))
+    return jnp.searchsorted(reached, drawn, side="right").astype(jnp.int32)
 
 
 def whole_view(size_px: Int[Array, "2"], crop_px: tuple[int, int]) -> View:
@@ -166,7 +204,7 @@ def augment(
 ) -> tuple[Float[Array, "h w 3"], UInt8[Array, "h w"]]:
     """One training example out of one image: a random crop in random light, or the whole image where `original`."""
     view_key, light_key = jax.random.split(key)
-    drawn = draw_view(view_key, size_px, options)
+    drawn = draw_view(view_key, labels, size_px, options)
     view = jax.tree.map(
         lambda whole, part: jnp.where(original, whole, part), whole_view(size_px, options.crop_px), drawn
     )

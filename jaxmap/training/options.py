@@ -27,6 +27,8 @@ class AugmentationOptions:
     """Height and width of an example."""
     scale: tuple[Positive, Positive] = (0.75, 1.75)
     """Least and greatest factor that images are resized by."""
+    class_share: Annotated[float, Interval(ge=0, le=1)] = 0.0
+    """Share of the examples that are laid around a pixel of a class, each class of the image as often as the others."""
     mirror: bool = True
     """Exchange left and right of every second example."""
     copies: Annotated[int, Ge(0)] | None = None

@@ -14,7 +14,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from jaxmap.labels import IGNORE
-from jaxmap.training.augment import View, augment, change_light, cut, draw_view, whole_view
+from jaxmap.training.augment import View, augment, change_light, cut, draw_pixel, draw_view, whole_view
 from jaxmap.training.options import AugmentationOptions
 
 STORED_PX = (20, 24)
@@ -27,6 +27,8 @@ LIGHT = replace(OPTIONS, brightness=0.5, contrast=0.5, saturation=0.5, gamma=0.5
 
 fast_cut = jax.jit(partial(cut, crop_px=CROP_PX, fill=FILL))
 fast_draw = jax.jit(partial(draw_view, options=OPTIONS))
+around_draw = jax.jit(partial(draw_view, options=replace(OPTIONS, class_share=1.0)))
+draw_pixels = jax.jit(jax.vmap(draw_pixel, in_axes=(0, None, None)))
 fast_augment = jax.jit(partial(augment, options=OPTIONS, fill=FILL))
 lit_augment = jax.jit(jax.vmap(partial(augment, options=LIGHT, fill=FILL)))
 """Of two examples at once."""
@@ -177,9 +179,9 @@ def test_the_whole_view_shows_the_whole_image_in_the_middle(size_px, crop_px):
     assert not bool(view.mirrored)
 
 
-@given(sizes, seeds)
-def test_a_drawn_view_lies_on_its_image_or_the_image_in_it(size_px, seed):
-    view = fast_draw(jax.random.key(seed), jnp.array(size_px))
+@given(sizes, seeds, st.sampled_from([fast_draw, around_draw]))
+def test_a_drawn_view_lies_on_its_image_or_the_image_in_it(size_px, seed, draw):
+    view = draw(jax.random.key(seed), example(size_px, seed)[1], jnp.array(size_px))
     assert OPTIONS.scale[0] <= float(view.scale) < OPTIONS.scale[1]
     for offset, size, count in zip(view.offset_px.tolist(), size_px, CROP_PX, strict=True):
         scaled = int(np.floor(np.float32(size) * np.float32(view.scale)))
@@ -192,8 +194,9 @@ def test_draws_reach_all_that_they_may():
     @jax.jit
     @jax.vmap
     def draw(key: jax.Array) -> tuple[View, View]:
-        size_px = jnp.array([24, 30])
-        return draw_view(key, size_px, fixed), draw_view(key, size_px, replace(OPTIONS, mirror=False))
+        size_px, labels = jnp.array([24, 30]), jnp.zeros((24, 30), jnp.uint8)
+        still = replace(OPTIONS, mirror=False)
+        return draw_view(key, labels, size_px, fixed), draw_view(key, labels, size_px, still)
 
     views, never = draw(jax.random.split(jax.random.key(0), 400))
     assert set(views.offset_px[:, 0].tolist()) == set(range(24 - CROP_PX[0] + 1))
@@ -201,6 +204,46 @@ def test_draws_reach_all_that_they_may():
     assert 0.4 < views.mirrored.mean() < 0.6
     assert not never.mirrored.any()
     assert never.scale.min() < 0.5 and never.scale.max() > 2.4
+
+
+@given(sizes, seeds)
+def test_drawn_pixels_are_of_all_classes_of_the_image_evenly(size_px, seed):
+    _, labels = example(size_px, seed)
+    labels[0, 0] = 200  # A class of one pixel.
+    rows, columns = draw_pixels(jax.random.split(jax.random.key(seed), 400), labels, np.array(size_px))
+    drawn = labels[np.asarray(rows), np.asarray(columns)]
+    held = set(labels[: size_px[0], : size_px[1]].ravel().tolist()) - {IGNORE}
+    assert set(drawn.tolist()) == held
+    spread = 5 * np.sqrt(400 / len(held))
+    assert all(abs((drawn == one).sum() - 400 / len(held)) < spread for one in held)
+
+
+def test_a_pixel_of_an_image_without_labels_is_its_first():
+    labels = np.full(STORED_PX, IGNORE, np.uint8)
+    rows, columns = draw_pixels(jax.random.split(jax.random.key(0), 2), labels, np.array(STORED_PX))
+    assert not rows.any() and not columns.any()
+
+
+def test_crops_around_classes_hold_what_is_rare():
+    labels = np.zeros((64, 80), np.uint8)
+    labels[50, 7] = 2
+    size_px, enlarged = np.array(labels.shape), replace(OPTIONS, scale=(1.0, 2.0))
+
+    def held(class_share: float) -> float:
+        draw = partial(draw_view, options=replace(enlarged, class_share=class_share))
+        views = jax.jit(jax.vmap(draw, in_axes=(0, None, None)))(
+            jax.random.split(jax.random.key(1), 300), labels, size_px
+        )
+        crops = (
+            cut_of(
+                jax.tree.map(lambda leaf, i=i: leaf[i], views), np.zeros((*labels.shape, 3), np.uint8), labels, size_px
+            )
+            for i in range(300)
+        )
+        return float(np.mean([(near == 2).any() for _, near in crops]))
+
+    assert held(0.0) < 0.15
+    assert 0.4 < held(1.0) < 0.65, "one of two classes is chosen"
 
 
 def test_the_same_key_is_the_same_example_whatever_stands_beside_it():
