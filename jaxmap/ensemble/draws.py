@@ -7,6 +7,7 @@ the others as they are.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,44 +21,55 @@ from jaxmap.fusion.params import FusionParams
 _MOST_DECADES = 3.0
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class EnsembleParams:
-    """The numbers of all members, each leaf of `fusion` with a leading axis of members.
+class MemberParams(NamedTuple):
+    """The sensor model as a member takes it.
 
-    `temperature` divides the logits of soft labels; `disparity_sigma_px` is that of errors shared by blocks of
-    `block_px` pixels; `at_once` members are computed together.
+    `temperature` divides the logits of soft labels, `bias` is added to those of each class.
     """
 
     fusion: FusionParams
-    temperature: Float[Array, "M"]
+    temperature: Float[Array, ""]
+    bias: Float[Array, "C"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class EnsembleParams:
+    """The numbers of all members: every leaf of `sensor` has a leading axis of members.
+
+    `disparity_sigma_px` is that of errors shared by blocks of `block_px` pixels; `at_once` members are computed
+    together.
+    """
+
+    sensor: MemberParams
     disparity_sigma_px: Float[Array, ""]
     block_px: int = field(metadata={"static": True})
     at_once: int = field(metadata={"static": True})
 
 
 def draw_ensemble_params(key: PRNGKeyArray, fusion: FusionParams, options: EnsembleOptions) -> EnsembleParams:
-    """Each member's sensor model: increments and temperature scaled by log-normal factors of median 1.
+    """Each member's sensor model: increments and temperature scaled by log-normal factors of median 1, biased logits.
 
-    One factor for the occupancy of a hit, one for that of a miss, one for each label. How maps are read (priors,
-    thresholds) is the same for all.
+    There is one factor for the occupancy of a hit, one for that of a miss and one for each label. How maps are read
+    (priors, thresholds) is the same for all.
     """
     labels = fusion.class_increments.shape[0]
 
-    def draw(member: Int[Array, ""]) -> tuple[FusionParams, Float[Array, ""]]:
-        normal = jax.random.normal(jax.random.fold_in(key, member), (3 + labels,))
+    def draw(member: Int[Array, ""]) -> MemberParams:
+        normal = jax.random.normal(jax.random.fold_in(key, member), (3 + 2 * labels,))
         factor = _log_normal(options.increment_sigma * normal)
         drawn = replace(
             fusion,
             occupancy_hit=fusion.occupancy_hit * factor[0],
             occupancy_miss=fusion.occupancy_miss * factor[1],
-            class_increments=fusion.class_increments * factor[3:, None],
+            class_increments=fusion.class_increments * factor[3 : 3 + labels, None],
         )
-        return drawn, _log_normal(options.temperature_sigma * normal[2])
+        temperature = _log_normal(options.temperature_sigma * normal[2])
+        return MemberParams(drawn, temperature, options.label_bias_sigma * normal[3 + labels :])
 
-    members, temperature = jax.vmap(draw)(jnp.arange(options.members))
     sigma_px = jnp.asarray(options.disparity_sigma_px, jnp.float32)
-    return EnsembleParams(members, temperature, sigma_px, options.disparity_block_px, options.at_once)
+    sensor = jax.vmap(draw)(jnp.arange(options.members))
+    return EnsembleParams(sensor, sigma_px, options.disparity_block_px, options.at_once)
 
 
 def _log_normal(exponent: Float[Array, "*s"]) -> Float[Array, "*s"]:
@@ -68,7 +80,7 @@ def _log_normal(exponent: Float[Array, "*s"]) -> Float[Array, "*s"]:
 def draw_pose_errors(
     key: PRNGKeyArray, timestamps_s: Float[np.ndarray, "N"], options: EnsembleOptions
 ) -> Float32[np.ndarray, "N M 6"]:
-    """Errors of the camera's pose along a drive, for each member: shift in metres, turn as a rotation vector, world axes.
+    """Errors of the camera's pose along a drive: shift in metres, then turn as a rotation vector, along world axes.
 
     Each of the six is a first-order Gauss-Markov process (Gelb, *Applied Optimal Estimation*, 1974, section 3.8): of
     the same standard deviation at all times, correlated by `exp(-dt / correlation)` between two of them. The world is

@@ -36,15 +36,19 @@ class EnsembleLayers(NamedTuple):
 def ensemble_layers(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> EnsembleLayers:
     """The probability of the class asked about (`FusionRule.target`), and that the map misses it.
 
-    Poses, disparities and the sensor model are not known but to their errors `e`; what is asked is the probability
-    whatever these were, `p(rock | z) = E_e[p(rock | z, e)]`, the law of total probability (Bayesian model averaging,
-    Hoeting et al. 1999, eq. 1). With the members drawn from the errors, and the map itself as one more, of no error,
+    Poses, disparities and the sensor model are known but to their errors `e`. What a map says under given errors is
+    its call, `r_e = [p(rock | z, e) > threshold]`; what is asked is how likely that call is whatever they were, the
+    expectation `E_e[r_e]`, which the members sample (the Monte Carlo propagation of distributions of JCGM 101:2008;
+    bagged classifiers vote so, Breiman 1996):
 
-        probability = (p_0 + sum_m s_m p_m) / (1 + sum_m s_m),    missed = 0 where the map calls rock, else probability,
+        probability = (r_0 + sum_m s_m r_m) / (1 + sum_m s_m),    missed = 0 where the map calls rock, else probability,
 
-    where `p_m` is what member `m` gives the column from above (`query.top_down`) and `s_m` whether it saw a surface
-    there: of ground that it did not see it has nothing to say. Assumed are errors as drawn, independent of what the
-    labels get wrong: rock that every frame labels sand is not found by this.
+    where the map itself is one more member (0), of no error, and `s_m` is whether member `m` saw a surface in the
+    column: of ground that it did not see it has nothing to say. Without spread all members agree and nothing is missed.
+
+    It is the calls that are averaged, not `p(rock | z, e)`: this goes to its prior where there is hardly any evidence,
+    and so would find most missed rocks on the farthest ground. Assumed are errors as drawn, and calls that are right
+    but for them: a rock that every frame labels sand with certainty stays missed.
 
     Args:
         voxel_map: with members.
@@ -55,17 +59,18 @@ def ensemble_layers(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule)
     assert target is not None and voxel_map.members is not None
     index = voxel_map.classes.index(target)
     own = top_down(voxel_map, params, rule)
+    called = own.observed & (own.label == index)
     read_one = replace(params, class_prior=params.class_prior[index : index + 1])
 
     def add(sums: tuple[Array, Array], log_odds: Array) -> tuple[tuple[Array, Array], None]:
         member = replace(voxel_map, log_odds=log_odds, classes=(target,), members=None)
         top = top_down(member, read_one, rule)
-        return (sums[0] + jnp.where(top.observed, top.probability[0], 0.0), sums[1] + top.observed), None
+        return (sums[0] + (top.label == 0), sums[1] + top.observed), None
 
-    start = (own.probability[index], jnp.ones(own.observed.shape, jnp.float32))
-    (total, count), _ = jax.lax.scan(add, start, voxel_map.members)
-    probability = jnp.where(own.observed, total / count, jnp.nan)
-    return EnsembleLayers(probability, jnp.where(own.observed & (own.label == index), 0.0, probability))
+    start = (called.astype(jnp.float32), jnp.ones(called.shape, jnp.float32))
+    (calls, seen), _ = jax.lax.scan(add, start, voxel_map.members)
+    probability = jnp.where(own.observed, calls / seen, jnp.nan)
+    return EnsembleLayers(probability, jnp.where(called, 0.0, probability))
 
 
 def named_layers(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> dict[str, Float[np.ndarray, "X Y"]]:

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxmap.ensemble.draws import EnsembleParams, disparity_noise, displaced
+from jaxmap.ensemble.draws import EnsembleParams, MemberParams, disparity_noise, displaced
 from jaxmap.fusion.integrate import window_evidence
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.params import FusionRule
 from jaxmap.fusion.view import Reach, view_of
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import Window
@@ -52,10 +52,10 @@ def fuse_members(
     assert voxel_map.members is not None and frame.pose_errors is not None
     count = voxel_map.members.shape[0]
     at_once = next(size for size in range(min(params.at_once, count), 0, -1) if count % size == 0)
-    drawn = (jnp.arange(count), params.fusion, params.temperature, frame.pose_errors)
+    drawn = (jnp.arange(count), params.sensor, frame.pose_errors)
 
-    def evidence_of(number: Array, fusion: FusionParams, temperature: Array, error: Array) -> tuple[Array, Array]:
-        member = _Member(fusion, temperature, error, jax.random.fold_in(key, number))
+    def evidence_of(number: Array, sensor: MemberParams, error: Array) -> tuple[Array, Array]:
+        member = _Member(sensor, error, jax.random.fold_in(key, number))
         evidence, window = _member_evidence(frame, labels, site, params, member)
         return evidence, window.start
 
@@ -79,8 +79,7 @@ def fuse_members(
 
 
 class _Member(NamedTuple):
-    fusion: FusionParams
-    temperature: Float[Array, ""]
+    sensor: MemberParams
     pose_error: Float[Array, "6"]
     key: PRNGKeyArray
 
@@ -97,18 +96,26 @@ def _member_evidence(
     in_range = valid & (depth_m >= low_m) & (depth_m <= high_m)
     points_world = transform_points(T_world_camera, points_camera).reshape(-1, 3)
     points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
-    view = view_of(site.grid, site.camera, T_world_camera, depth_m, valid, member.fusion, site.rule, site.reach)
-    own = tempered(labels, member.temperature)._replace(keep=labels.keep & in_range.reshape(-1))
+    view = view_of(site.grid, site.camera, T_world_camera, depth_m, valid, member.sensor.fusion, site.rule, site.reach)
+    own = doubted(labels, member.sensor)._replace(keep=labels.keep & in_range.reshape(-1))
     evidence, _ = window_evidence(
-        site.grid, points_world, own, view.weights, site.class_count, member.fusion, site.rule, view.window, view.free
+        site.grid,
+        points_world,
+        own,
+        view.weights,
+        site.class_count,
+        member.sensor.fusion,
+        site.rule,
+        view.window,
+        view.free,
     )
     return jnp.stack([evidence[0], evidence[1 + site.target]]), view.window
 
 
-def tempered(labels: PointLabels, temperature: Float[Array, ""]) -> PointLabels:
-    """Soft labels with their logits divided by a temperature; hard ones stay as they are.
+def doubted(labels: PointLabels, member: MemberParams) -> PointLabels:
+    """Soft labels with their logits divided by a member's temperature and biased; hard ones stay as they are.
 
-    What the probabilities lack to 1, that of no class, is one more class in this.
+    What the probabilities lack to 1, that of no class, is one more class in this, without a bias.
     """
     if labels.probabilities is None:
         return labels
@@ -118,8 +125,12 @@ def tempered(labels: PointLabels, temperature: Float[Array, ""]) -> PointLabels:
     shares.append(1.0 - sum(shares[1:], shares[0]))
     logits = [jnp.log(jnp.maximum(share, _LEAST_PROBABILITY)) for share in shares]
     top = functools.reduce(jnp.maximum, logits)
-    powers = [jnp.exp((logit - top) / temperature) for logit in logits]
+    logits = [(logit - top) / member.temperature for logit in logits]
+    logits = [*(logit + member.bias[c] for c, logit in enumerate(logits[:-1])), logits[-1]]
+    top = functools.reduce(jnp.maximum, logits)
+    powers = [jnp.exp(logit - top) for logit in logits]
     total = sum(powers[1:], powers[0])
     changed = jnp.stack([power / total for power in powers[:-1]], axis=-1)
-    # At a temperature of 1 the labels are those of the map, to the last bit.
-    return labels._replace(probabilities=jnp.where(temperature == 1.0, known, changed))
+    # A member that doubts nothing has the labels of the map, to the last bit.
+    same = (member.temperature == 1.0) & (member.bias == 0.0).all()
+    return labels._replace(probabilities=jnp.where(same, known, changed))

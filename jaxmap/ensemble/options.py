@@ -20,7 +20,8 @@ class EnsembleOptions:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 
     members: Annotated[int, Ge(0)] = 0
-    """Maps beside the map, each made with errors of its own; 0 makes none. Each takes 2 channels of the map's memory."""
+    """Maps beside the map, each made with errors of its own; 0 makes none. Each takes as much memory as the occupancy
+    and one class of the map."""
     position_sigma_m: Sigma = 0.02
     """Standard deviation of the camera's position, along each axis: RTK GPS is good for 0.01 to 0.03."""
     heading_sigma_rad: Sigma = 0.01
@@ -38,5 +39,7 @@ class EnsembleOptions:
     """Relative standard deviation (log-normal) of what each label, a hit and a miss add to the log-odds."""
     temperature_sigma: Sigma = 0.3
     """Relative standard deviation (log-normal) of the temperature of soft labels."""
+    label_bias_sigma: Sigma = 1.0
+    """Standard deviation of what is added to the logits of each class of soft labels, the same for the whole drive."""
     at_once: Annotated[int, Gt(0)] = 1
     """Members computed together: faster on an accelerator, at the cost of memory. The result is the same."""
