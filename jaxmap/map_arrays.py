@@ -19,7 +19,7 @@ _CHUNK_CELLS = 128
 
 
 class StoredArray(NamedTuple):
-    """An array and how it is stored: the names of its axes, and the number that chunks of nothing else are left out for."""
+    """An array and how it is stored: the names of its axes; chunks of nothing but the fill value are left out."""
 
     values: Float32[np.ndarray, "..."]
     axes: tuple[str, ...]

@@ -20,8 +20,8 @@ class EvaluateArguments:
 
     Cells count where the map observed a surface and the truth is labelled; the second row counts every labelled cell
     in the cameras' view, with unobserved ones as not rock. An ensemble (jaxmap map --ensemble.members) is scored by how
-    well it tells the missed cells among those not called rock. Writes scores.json and errors.png (true, false and missed
-    rock in colours) into the run folder and its report, or --out and OUT_errors.png.
+    well it tells the missed cells among those not called rock. Writes scores.json and errors.png (true, false and
+    missed rock in colours) into the run folder and its report, or --out and OUT_errors.png.
     """
 
     run: tyro.conf.Positional[Path]

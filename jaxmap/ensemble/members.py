@@ -22,6 +22,7 @@ from jaxmap.geometry.grid import Window
 from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap
 
 _LEAST_PROBABILITY = 1e-30
+_LEAST_REST = 1e-5
 
 
 class Site(NamedTuple):
@@ -88,7 +89,8 @@ def _member_evidence(
     frame: Frame, labels: PointLabels, site: Site, params: EnsembleParams, member: _Member
 ) -> tuple[Float[Array, "2 X Y Z"], Window]:
     """What a frame adds to one member, and to which part of the grid."""
-    noise = disparity_noise(member.key, frame.disparity_px.shape, params.block_px)
+    height_px, width_px = frame.disparity_px.shape
+    noise = disparity_noise(member.key, (height_px, width_px), params.block_px)
     T_world_camera = displaced(frame.T_world_camera, member.pose_error)
     points_camera, valid = disparity_to_points(site.camera, frame.disparity_px + params.disparity_sigma_px * noise)
     depth_m = points_camera[..., 2]
@@ -122,7 +124,9 @@ def doubted(labels: PointLabels, member: MemberParams) -> PointLabels:
     known = labels.probabilities
     # Class by class: XLA does not vectorise over a short last axis.
     shares = [known[:, c] for c in range(known.shape[1])]
-    shares.append(1.0 - sum(shares[1:], shares[0]))
+    rest = 1.0 - sum(shares[1:], shares[0])
+    # What rounding leaves over is nothing: a high temperature would make something of it.
+    shares.append(jnp.where(rest > _LEAST_REST, rest, 0.0))
     logits = [jnp.log(jnp.maximum(share, _LEAST_PROBABILITY)) for share in shares]
     top = functools.reduce(jnp.maximum, logits)
     logits = [(logit - top) / member.temperature for logit in logits]

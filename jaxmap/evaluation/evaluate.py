@@ -166,7 +166,7 @@ def evaluate_map(
     }
     if class_map.ensemble is not None:
         missing = counted & ~called
-        expected = _ensemble_cells(class_map, options.cell_size_m)[here]
+        expected = _ensemble_cells(class_map, class_map.ensemble, options.cell_size_m)[here]
         scores["ensemble"] = missed_scores(expected[missing], np.asarray(said.share)[missing], truly[missing])
     if options.register:
         unmoved = before.truly(options.rock_fraction)
@@ -196,10 +196,12 @@ def missed_scores(
     }
 
 
-def _ensemble_cells(class_map: ClassMap, cell_size_m: float) -> Float[np.ndarray, "I J"]:
+def _ensemble_cells(
+    class_map: ClassMap, probability: Float[np.ndarray, "X Y"], cell_size_m: float
+) -> Float[np.ndarray, "I J"]:
     """The expected share of each cell that is of the class, by the ensemble; what was not observed is not."""
     shares = column_shares(class_map.grid, make_cells(class_map.grid, cell_size_m))
-    columns = np.where(class_map.observed, class_map.ensemble, 0.0).astype(np.float32)
+    columns = np.where(class_map.observed, probability, 0.0).astype(np.float32)
     # The sums of areas such as 0.2 / 3 are not exact.
     return (np.asarray(area_in_cells(shares, columns)) / shares.columns_per_cell).clip(0, 1)
 

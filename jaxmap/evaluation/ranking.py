@@ -59,7 +59,7 @@ def reliability(probability: Float[np.ndarray, "N"], truth: Bool[np.ndarray, "N"
 
 
 def ranking_scores(score: Float[np.ndarray, "N"], truth: Bool[np.ndarray, "N"]) -> dict[str, Any]:
-    """`auc`, `average_precision`, and how well the score is calibrated if it is a probability: `nll`, `brier`, `ece`."""
+    """`auc` and `average_precision`, and `nll`, `brier` and `ece` of the score as a probability."""
     counted = np.ones(len(score), bool)
     return {
         "auc": roc_auc(score, truth),

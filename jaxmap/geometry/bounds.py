@@ -45,7 +45,7 @@ def grid_around_views(
 
 
 def map_bytes(grid: GridSpec, class_count: int, members: int = 0) -> int:
-    """Memory of a map's tensors, float32: a channel for occupancy and each class, two for each member of an ensemble."""
+    """Memory of a map's tensors, float32: channels for occupancy and each class, two for each member of an ensemble."""
     # Of Python integers: NumPy's would wrap round.
     return 4 * (1 + class_count + 2 * members) * math.prod(grid.shape)
 
