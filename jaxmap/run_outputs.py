@@ -107,7 +107,7 @@ def count_missed(rule: FusionRule, attributes: MapAttributes, voxel_map: VoxelMa
             "class": target,
             "members": len(voxel_map.members),
             "missed_area_expected_m2": round(float(np.nansum(missed)) * column_m2, 4),
-            "called_area_m2": round(int((missed == 0).sum()) * column_m2, 4),
+            "called_area_m2": round(int(layers.called().sum()) * column_m2, 4),
             "observed_area_m2": round(int(np.isfinite(missed).sum()) * column_m2, 4),
             "greatest_missed_probability": round(float(np.nanmax(missed, initial=0.0)), 4),
         }

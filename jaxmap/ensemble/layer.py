@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionParams, FusionRule
@@ -30,6 +30,10 @@ class EnsembleLayers(NamedTuple):
 
     probability: Float[AnyArray, "X Y"]
     missed: Float[AnyArray, "X Y"]
+
+    def called(self) -> Bool[np.ndarray, "X Y"]:
+        """The columns that the map itself calls by the class: there its own call makes the probability positive."""
+        return (np.asarray(self.missed) == 0) & (np.asarray(self.probability) > 0)
 
 
 @partial(jax.jit, static_argnames="rule")

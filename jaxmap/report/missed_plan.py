@@ -36,8 +36,10 @@ if TYPE_CHECKING:
 MOST = 0.5
 """Probabilities from here on have the last colour: what is more likely than not is called by most thresholds."""
 
-_RAMP = ["#efe6d2", "#f6c667", "#ee8434", "#c9302c", "#7a0f3c"]
+_RAMP = ["#e2d7bf", "#f7bf4f", "#ee7d2f", "#c9302c", "#7a0f3c"]
 _CALLED = (74, 78, 88)
+_LIGHT = 0.2
+"""How much of the light is shown: hints of the ground, while colours can be found again on the bar."""
 
 
 def missed_picture(
@@ -101,10 +103,9 @@ def missed_colours(
     if not observed.any():
         return colours
     base = np.array(_colour_map()(np.nan_to_num(missed[observed]) / MOST, bytes=True))[:, :3]
-    base[missed[observed] == 0] = _CALLED
+    base[layers.called()[observed]] = _CALLED
     shade = ground_shade(np.asarray(top.height_m, np.float64), observed, cell_size_m)[observed]
-    # Half the light: colours must be found again on the bar.
-    colours[observed] = np.rint(base * (0.5 + 0.5 * shade[:, None])).clip(0, 255)
+    colours[observed] = np.rint(base * (1 - _LIGHT + _LIGHT * shade[:, None])).clip(0, 255)
     return colours
 
 
