@@ -18,11 +18,10 @@ from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.deeplab_labeller import make_deeplab_labeller
-from jaxmap.ensemble.draws import EnsembleParams, draw_ensemble_params, draw_pose_errors
-from jaxmap.ensemble.options import EnsembleOptions
+from jaxmap.ensemble.draws import draw_ensemble
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.files import bundled
-from jaxmap.fusion.params import FusionParams, FusionRule, make_fusion_params
+from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
@@ -150,15 +149,13 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         fusion_rule = FusionRule(**rule)
         fusion_params = make_fusion_params(labeller.classes, **params)
         members = _members(config, fusion_rule, labeller.classes)
-    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
-    tell(
-        f"depth {depth_range_m[0]:g} to {max_depth_m:g} m; grid {' x '.join(map(str, grid.shape))} voxels of {size} m, "
-        f"{1 + len(labeller.classes)} channels{f' and {members} members of 2' if members else ''}: "
-        f"{map_bytes(grid, len(labeller.classes), members) / 2**20:.0f} MiB"
-    )
+    tell(_told_grid(grid, depth_range_m, len(labeller.classes), members))
     check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
     key = jax.random.key(config.seed)
-    ensemble, pose_errors = _draw_ensemble(key, config.ensemble, fusion_params, sequence) if members else (None, None)
+    timestamps_s = np.array([frame.timestamp_s for frame in sequence.frames], np.float64)
+    ensemble, pose_errors = (
+        draw_ensemble(key, fusion_params, timestamps_s, config.ensemble) if members else (None, None)
+    )
 
     return Plan(
         source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
@@ -178,6 +175,16 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     )
 
 
+def _told_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
+    """One line on what is mapped, and the memory it takes."""
+    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
+    return (
+        f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
+        f"{size} m, {1 + class_count} channels{f' and {members} members of 2' if members else ''}: "
+        f"{map_bytes(grid, class_count, members) / 2**20:.0f} MiB"
+    )
+
+
 def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int:
     """How many members the ensemble has.
 
@@ -193,16 +200,6 @@ def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int
             fix="name a class with --fusion.priority-classes, or leave the ensemble out",
         )
     return members
-
-
-def _draw_ensemble(
-    key: PRNGKeyArray, options: EnsembleOptions, fusion: FusionParams, sequence: StereoSequence
-) -> tuple[EnsembleParams, np.ndarray]:
-    """The numbers of all members, and the errors of their poses."""
-    # Steps fold the number of fused frames into the key: this one is out of their reach.
-    params_key, poses_key = jax.random.split(jax.random.fold_in(key, 2**32 - 1))
-    timestamps_s = np.array([frame.timestamp_s for frame in sequence.frames], np.float64)
-    return draw_ensemble_params(params_key, fusion, options), draw_pose_errors(poses_key, timestamps_s, options)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.fusion.params import FusionParams
 
 _MOST_DECADES = 3.0
+_NO_FRAME = 2**32 - 1
 
 
 class MemberParams(NamedTuple):
@@ -45,6 +46,22 @@ class EnsembleParams:
     disparity_sigma_px: Float[Array, ""]
     block_px: int = field(metadata={"static": True})
     at_once: int = field(metadata={"static": True})
+
+
+def draw_ensemble(
+    key: PRNGKeyArray, fusion: FusionParams, timestamps_s: Float[np.ndarray, "N"], options: EnsembleOptions
+) -> tuple[EnsembleParams, Float32[np.ndarray, "N M 6"]]:
+    """All that the members of a run draw before its first frame: their numbers, and the errors of their poses.
+
+    Args:
+        key: the run's own, as the steps take it.
+        fusion: the sensor model of the map.
+        timestamps_s: of all frames.
+        options: how many members, and their spread.
+    """
+    # Steps fold the number of fused frames into the key: this one is out of their reach.
+    params_key, poses_key = jax.random.split(jax.random.fold_in(key, _NO_FRAME))
+    return draw_ensemble_params(params_key, fusion, options), draw_pose_errors(poses_key, timestamps_s, options)
 
 
 def draw_ensemble_params(key: PRNGKeyArray, fusion: FusionParams, options: EnsembleOptions) -> EnsembleParams:
