@@ -152,10 +152,10 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     tell(_told_grid(grid, depth_range_m, len(labeller.classes), members))
     check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
     key = jax.random.key(config.seed)
-    timestamps_s = np.array([frame.timestamp_s for frame in sequence.frames], np.float64)
-    ensemble, pose_errors = (
-        draw_ensemble(key, fusion_params, timestamps_s, config.ensemble) if members else (None, None)
-    )
+    ensemble, pose_errors = None, None
+    if members:
+        timestamps_s = np.array([frame.timestamp_s for frame in sequence.frames], np.float64)
+        ensemble, pose_errors = draw_ensemble(key, fusion_params, timestamps_s, config.ensemble)
 
     return Plan(
         source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
