@@ -1,6 +1,9 @@
 from .datasets import ReadOptions, StereoSequence, open_sequence
 from .datasets.images import read_image
 from .deeplab_labeller import make_deeplab_labeller
+from .ensemble.draws import draw_ensemble
+from .ensemble.layer import EnsembleLayers, ensemble_layers
+from .ensemble.options import EnsembleOptions
 from .errors import FrameError, JaxmapError, UsageError
 from .fusion.carve import carve
 from .fusion.integrate import integrate
@@ -40,6 +43,8 @@ __all__ = [
     "IGNORE",
     "ROVER_CLASSES",
     "Architecture",
+    "EnsembleLayers",
+    "EnsembleOptions",
     "Frame",
     "FrameError",
     "FusionParams",
@@ -67,6 +72,8 @@ __all__ = [
     "class_probabilities",
     "depth_sigma",
     "disparity_to_points",
+    "draw_ensemble",
+    "ensemble_layers",
     "fit_plane_mlesac",
     "fold_batch_norm",
     "import_weights",

@@ -11,6 +11,7 @@ import tyro
 from annotated_types import Ge, Gt, Interval, Lt
 from pydantic import ConfigDict
 
+from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import UsageError
 from jaxmap.settings import Settings
 from jaxmap.stereo.options import StereoOptions
@@ -220,6 +221,7 @@ class MapConfig:
     fusion: FusionConfig = field(default_factory=FusionConfig)
     plane: PlaneConfig = field(default_factory=PlaneConfig)
     deeplab: DeeplabConfig = field(default_factory=DeeplabConfig)
+    ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
 
 
 _SETTINGS = Settings(MapConfig, "map", given=("sequence",))

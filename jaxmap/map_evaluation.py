@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.datasets.orthomosaic import read_label_orthomosaic, read_picture
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.datasets.rock_list import DEFAULT_DIAMETERS_M, draw_rocks, find_rock_lists, read_rock_lists
+from jaxmap.ensemble.layer import stored_layers
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.evaluate import ClassMap, Evaluation, ScoringOptions, evaluate_map
 from jaxmap.evaluation.truth_cells import PixelCorners, pixel_corners, sample_between
@@ -67,9 +68,11 @@ def read_class_map(run: Path, target: str) -> ClassMap:
         known = f"its classes are {' '.join(voxel_map.classes)}" if voxel_map.classes else "it has no class at all"
         raise UsageError(f"the map has no class {target!r}: {known}", where=folder.map, fix="name one with --class")
     params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
-    return class_map_of(
+    class_map = class_map_of(
         voxel_map, params, rule, target, site_origin=np.asarray(attributes.site_origin, np.float64), crs=attributes.crs
     )
+    ensemble = stored_layers(attributes.layers, target, folder.map)
+    return class_map if ensemble is None else replace(class_map, ensemble=np.asarray(ensemble.probability))
 
 
 def class_map_of(

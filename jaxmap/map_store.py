@@ -6,7 +6,6 @@ until then. A process that dies at any moment leaves one of the two to load.
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import shutil
@@ -20,14 +19,16 @@ from jaxtyping import Float
 
 from jaxmap.errors import JaxmapError
 from jaxmap.files import sync, write_error
+from jaxmap.map_arrays import StoredArray, read_array, write_array
 from jaxmap.types import GridSpec, VoxelMap
 
 if TYPE_CHECKING:
     import zarr
 
 FORMAT_VERSION = 1
-_ARRAY = "log_odds"
-_CHUNK_VOXELS = 128
+LOG_ODDS = "log_odds"
+MEMBERS = "ensemble_log_odds"
+"""The members of an ensemble: float32 (M, 2, X, Y, Z), occupancy and the class that is asked about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,7 @@ class MapAttributes:
         T_world_source: turns the world of the poses' source into the map's z-up world.
         fusion: the parameters and the rule the map was fused with; JSON values only.
         progress: how far the run got; `{"complete": True}` once it has ended.
+        layers: what else is known of each column, seen from above, by name; NaN where nothing is.
     """
 
     crs: str | None = None
@@ -47,6 +49,7 @@ class MapAttributes:
     T_world_source: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     fusion: dict[str, Any] = field(default_factory=dict)
     progress: dict[str, Any] = field(default_factory=lambda: {"complete": True})
+    layers: dict[str, Float[np.ndarray, "X Y"]] = field(default_factory=dict)
 
 
 def save_map(path: str | os.PathLike[str], voxel_map: VoxelMap, attributes: MapAttributes) -> None:
@@ -57,9 +60,10 @@ def save_map(path: str | os.PathLike[str], voxel_map: VoxelMap, attributes: MapA
             whatever was at `path` is still there.
     """
     target = Path(path)
-    # No copy where the device is the CPU.
-    log_odds = np.asarray(voxel_map.log_odds)
-    _check_finite(log_odds, target)
+    arrays = _arrays_of(voxel_map, attributes)
+    for name in (LOG_ODDS, MEMBERS):
+        if name in arrays:
+            _check_finite(arrays[name].values, target)
     temporary = target.with_name(f".{target.name}.new-{os.getpid()}")
     try:
         if target.exists() and not _replaceable(target):
@@ -69,7 +73,7 @@ def save_map(path: str | os.PathLike[str], voxel_map: VoxelMap, attributes: MapA
         target.parent.mkdir(parents=True, exist_ok=True)
         for stray in target.parent.glob(f".{target.name}.new-*"):
             shutil.rmtree(stray)
-        _write_group(temporary, log_odds, _to_json(voxel_map, attributes))
+        _write_group(temporary, arrays, _to_json(voxel_map, attributes))
         _sync_tree(temporary)
         _swap_in(temporary, target)
     except OSError as error:
@@ -84,8 +88,12 @@ def holds_map(path: str | os.PathLike[str]) -> bool:
     return target.exists() or _set_aside(target).exists()
 
 
-def load_map(path: str | os.PathLike[str]) -> tuple[VoxelMap, MapAttributes]:
+def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[VoxelMap, MapAttributes]:
     """Reads a map; where a save was cut off between its renames, the map from before it.
+
+    Args:
+        path: the folder.
+        members: read those of an ensemble, too, where the map has one: what a run goes on with.
 
     Raises:
         JaxmapError: there is no map, it was written by a newer version, its parts disagree, a chunk is
@@ -95,44 +103,46 @@ def load_map(path: str | os.PathLike[str]) -> tuple[VoxelMap, MapAttributes]:
     folder = target if target.exists() else _set_aside(target)
     if not folder.exists():
         raise JaxmapError("no such map", where=target, fix="give a map.zarr folder of `jaxmap map`")
-    array, stored = _open_group(folder, target)
+    arrays, stored = _open_group(folder, target)
     grid, classes, frames_fused, attributes = _from_json(stored, target)
-    expected = (1 + len(classes), *grid.shape)
-    if array.shape != expected or array.dtype != np.float32:
-        raise JaxmapError(
-            f"log_odds is {array.dtype} {array.shape}, its attributes say float32 {expected}",
-            where=target,
-            fix="make the map again",
-        )
-    log_odds = _read_chunks(array, stored.get("chunks_stored"), target)
+    log_odds = read_array(arrays, LOG_ODDS, (1 + len(classes), *grid.shape), stored.get("chunks_stored"), target)
     _check_finite(log_odds, target)
+    counts = _chunk_counts(stored, target)
+    for name in attributes.layers:
+        attributes.layers[name] = read_array(arrays, name, grid.shape[:2], counts.get(name), target)
+    ensemble = None
+    if members and MEMBERS in arrays:
+        shape = (arrays[MEMBERS].shape[0], 2, *grid.shape)
+        ensemble = read_array(arrays, MEMBERS, shape, counts.get(MEMBERS), target)
+        _check_finite(ensemble, target)
     voxel_map = VoxelMap(
-        log_odds=jnp.asarray(log_odds), frames_fused=jnp.asarray(frames_fused, jnp.int32), grid=grid, classes=classes
+        log_odds=jnp.asarray(log_odds),
+        frames_fused=jnp.asarray(frames_fused, jnp.int32),
+        grid=grid,
+        classes=classes,
+        members=None if ensemble is None else jnp.asarray(ensemble),
     )
     return voxel_map, attributes
 
 
-def _write_group(folder: Path, log_odds: np.ndarray, stored: dict[str, Any]) -> None:
+def _arrays_of(voxel_map: VoxelMap, attributes: MapAttributes) -> dict[str, StoredArray]:
+    """All that is stored of a map; no copies where the device is the CPU."""
+    arrays = {LOG_ODDS: StoredArray(np.asarray(voxel_map.log_odds), ("channel", "x", "y", "z"))}
+    if voxel_map.members is not None:
+        arrays[MEMBERS] = StoredArray(np.asarray(voxel_map.members), ("member", "channel", "x", "y", "z"))
+    for name, values in attributes.layers.items():
+        arrays[name] = StoredArray(np.asarray(values, np.float32), ("x", "y"), fill_value=np.nan)
+    return arrays
+
+
+def _write_group(folder: Path, arrays: dict[str, StoredArray], stored: dict[str, Any]) -> None:
     import zarr
-    from zarr.codecs import ZstdCodec
 
     group = zarr.create_group(folder, zarr_format=3)
-    array = group.create_array(
-        _ARRAY,
-        shape=log_odds.shape,
-        dtype="float32",
-        chunks=(1, *(min(size, _CHUNK_VOXELS) for size in log_odds.shape[1:])),
-        # Measured on sparse maps: smaller and twice as fast as Blosc; its checksum finds damaged chunks.
-        compressors=ZstdCodec(level=1, checksum=True),
-        fill_value=0.0,
-        dimension_names=("channel", "x", "y", "z"),
-    )
-    # One chunk a call: after a failed one nothing goes on writing in the background while we clean up.
-    for corner in itertools.product(*(range(0, *pair) for pair in zip(array.shape, array.chunks, strict=True))):
-        chunk = tuple(slice(start, start + size) for start, size in zip(corner, array.chunks, strict=True))
-        array[chunk] = log_odds[chunk]
-    # Chunks of zeros are not stored, so a lost chunk would read as zeros: their number tells.
-    group.update_attributes({**stored, "chunks_stored": array.nchunks_initialized})
+    counts = {name: write_array(group, name, array) for name, array in arrays.items()}
+    # Chunks of the fill value are not stored, so a lost chunk would read as that: their number tells.
+    stored["chunks_stored"] = counts.pop(LOG_ODDS)
+    group.update_attributes(stored | ({"chunks_stored_of": counts} if counts else {}))
 
 
 def _swap_in(temporary: Path, target: Path) -> None:
@@ -177,7 +187,7 @@ def _check_finite(log_odds: np.ndarray, where: Path) -> None:
         )
 
 
-def _open_group(folder: Path, where: Path) -> tuple[zarr.Array, dict[str, Any]]:
+def _open_group(folder: Path, where: Path) -> tuple[dict[str, zarr.Array], dict[str, Any]]:
     import zarr
 
     try:
@@ -195,23 +205,20 @@ def _open_group(folder: Path, where: Path) -> tuple[zarr.Array, dict[str, Any]]:
             where=where,
             fix="upgrade jaxmap",
         )
-    for name, there in (("attribute format_version", version is not None), ("array log_odds", _ARRAY in members)):
+    for name, there in (("attribute format_version", version is not None), ("array log_odds", LOG_ODDS in members)):
         if not there:
             raise JaxmapError(f"not a jaxmap map: no {name}", where=where, fix="give a map.zarr folder of `jaxmap map`")
     if version != FORMAT_VERSION:
         raise _bad_attribute("format_version", version, where)
-    return members[_ARRAY], stored
+    return members, stored
 
 
-def _read_chunks(array: zarr.Array, chunks_stored: int | None, where: Path) -> np.ndarray:
-    fix = "restore the folder from a copy or make the map again"
-    if chunks_stored is not None and array.nchunks_initialized != chunks_stored:
-        raise JaxmapError(f"{array.nchunks_initialized} of {chunks_stored} chunks are there", where=where, fix=fix)
-    try:
-        return np.asarray(array[...])
-    # The codec raises whatever it likes on damaged bytes.
-    except Exception as error:
-        raise JaxmapError("a chunk of log_odds is damaged", where=where, fix=fix) from error
+def _chunk_counts(stored: dict[str, Any], where: Path) -> dict[str, int]:
+    """How many chunks of each array but the first were stored."""
+    counts = stored.get("chunks_stored_of", {})
+    if not (isinstance(counts, dict) and all(isinstance(count, int) for count in counts.values())):
+        raise _bad_attribute("chunks_stored_of", counts, where)
+    return counts
 
 
 def _to_json(voxel_map: VoxelMap, attributes: MapAttributes) -> dict[str, Any]:
@@ -228,6 +235,7 @@ def _to_json(voxel_map: VoxelMap, attributes: MapAttributes) -> dict[str, Any]:
         "frames_fused": int(voxel_map.frames_fused),
         "fusion": attributes.fusion,
         "progress": attributes.progress,
+        **({"layers": list(attributes.layers)} if attributes.layers else {}),
     }
     return json.loads(json.dumps(stored))
 
@@ -256,10 +264,18 @@ def _from_json(stored: dict[str, Any], where: Path) -> tuple[GridSpec, tuple[str
             T_world_source=_numbers(stored, "T_world_source", (4, 4), where),
             fusion=fusion,
             progress=progress,
+            layers=dict.fromkeys(_layer_names(stored, where), np.zeros((0, 0), np.float32)),
         )
         return grid, tuple(classes), int(_numbers(stored, "frames_fused", (), where)), attributes
     except KeyError as missing:
         raise JaxmapError(f"the attribute {missing} is missing", where=where, fix="make the map again") from missing
+
+
+def _layer_names(stored: dict[str, Any], where: Path) -> list[str]:
+    names = stored.get("layers", [])
+    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        raise _bad_attribute("layers", names, where)
+    return names
 
 
 def _numbers(stored: dict[str, Any], name: str, shape: tuple[int, ...], where: Path) -> np.ndarray:

@@ -11,16 +11,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree, UInt8
 
+from jaxmap.ensemble.draws import EnsembleParams
+from jaxmap.ensemble.members import Site, fuse_members
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
 from jaxmap.fusion.params import FusionParams, FusionRule
-from jaxmap.fusion.sensor_model import range_weight
+from jaxmap.fusion.view import Reach, view_of
 from jaxmap.geometry.camera import disparity_to_points, transform_points
-from jaxmap.geometry.grid import view_window, window_shape
+from jaxmap.geometry.grid import window_shape
 from jaxmap.labellers import Labeller, harden
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, GridSpec, Plane, PointLabels, StereoCamera, VoxelMap, make_voxel_map
+
+_ENSEMBLE_DRAW = 1
+"""Folded into a frame's key for the draws of the ensemble; the labeller draws from the key itself."""
 
 
 @jax.tree_util.register_dataclass
@@ -32,6 +36,8 @@ class MapperParams:
     fusion: FusionParams
     labeller: PyTree = ()
     """`Labeller.params`; most labellers have none."""
+    ensemble: EnsembleParams | None = None
+    """The numbers of an ensemble's members, where the mapper has any."""
 
 
 class StepInfo(NamedTuple):
@@ -82,6 +88,8 @@ def make_mapper(
     labeller: Labeller,
     rule: FusionRule,
     depth_range_m: tuple[float, float],
+    *,
+    members: int = 0,
 ) -> Mapper:
     """Builds a mapper.
 
@@ -92,17 +100,24 @@ def make_mapper(
         labeller: gives each point its class.
         rule: the discrete choices of fusion.
         depth_range_m: points nearer or farther than these are left out.
+        members: of an ensemble that is fused beside the map; its params then hold `ensemble`, its frames
+            `pose_errors`.
 
     Raises:
-        JaxmapError: a depth range that is none.
+        JaxmapError: a depth range that is none, or an ensemble without a class to ask about.
     """
     min_depth_m, max_depth_m = depth_range_m
     if not 0 <= min_depth_m < max_depth_m < float("inf"):
         raise JaxmapError(f"depth range {min_depth_m} to {max_depth_m} m", where="mapper", fix="take 0 <= min < max")
-    window_size = window_shape(grid, camera, max_depth_m)
+    reach = Reach(depth_range_m, window_shape(grid, camera, max_depth_m))
+    target = rule.target(labeller.classes)
+    if members and target is None:
+        raise JaxmapError(
+            "an ensemble needs a class whose misses it tells", where="mapper", fix="name one in priority_classes"
+        )
 
     def init() -> VoxelMap:
-        return make_voxel_map(grid, labeller.classes)
+        return make_voxel_map(grid, labeller.classes, members)
 
     def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
         """The labelled points of a frame; `key` is the frame's own."""
@@ -126,28 +141,25 @@ def make_mapper(
         return _Observation(depth_m, valid, in_range, points_world, labels, plane)
 
     def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
-        seen = observe(frame, params, jax.random.fold_in(key, voxel_map.frames_fused))
-        depth_m = seen.depth_m
+        frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
+        seen = observe(frame, params, frame_key)
         labels = harden(seen.labels) if rule.per_frame == "once" else seen.labels
-
-        window = view_window(voxel_map.grid, params.camera, frame.T_world_camera, max_depth_m, window_size)
-        weights = jnp.ones(depth_m.size, depth_m.dtype)
-        if rule.range_weighting:
-            weights = range_weight(params.camera, window.grid, depth_m.reshape(-1), params.fusion)
-        free = None
-        if rule.carve:
-            free = carve(
-                params.camera,
-                frame.T_world_camera,
-                depth_m,
-                seen.valid,
-                window.grid,
-                params.fusion,
-                depth_range_m=depth_range_m,
-            )
-        voxel_map, hits = integrate(
-            voxel_map, seen.points_world, labels, weights, params.fusion, rule, window=window, free=free
+        view = view_of(
+            voxel_map.grid, params.camera, frame.T_world_camera, seen.depth_m, seen.valid, params.fusion, rule, reach
         )
+        fused, hits = integrate(
+            voxel_map,
+            seen.points_world,
+            labels,
+            view.weights,
+            params.fusion,
+            rule,
+            window=view.window,
+            free=view.free,
+        )
+        if members:
+            fused = replace(fused, members=fuse_ensemble(voxel_map, frame, labels, params, frame_key))
+        free = view.free
         info = StepInfo(
             points_valid=seen.valid.sum(),
             points_in_range=seen.in_range.sum(),
@@ -156,15 +168,33 @@ def make_mapper(
             voxels_freed=(free & (hits == 0)).sum() if free is not None else jnp.zeros((), jnp.int32),
             plane=seen.plane,
         )
-        return voxel_map, info
+        return fused, info
+
+    def fuse_ensemble(
+        voxel_map: VoxelMap, frame: Frame, labels: PointLabels, params: MapperParams, frame_key: PRNGKeyArray
+    ) -> Array:
+        if params.ensemble is None or frame.pose_errors is None:
+            raise JaxmapError(
+                "the ensemble has no numbers to draw by",
+                where="mapper",
+                fix="fill MapperParams.ensemble and Frame.pose_errors",
+            )
+        assert target is not None
+        classes = labeller.classes
+        site = Site(params.camera, voxel_map.grid, rule, reach, len(classes), classes.index(target))
+        # Kept apart, so that the map comes out as it does without members.
+        frame, labels = jax.lax.optimization_barrier((frame, labels))
+        return fuse_members(
+            voxel_map, frame, labels, site, params.ensemble, jax.random.fold_in(frame_key, _ENSEMBLE_DRAW)
+        )
 
     def scan(voxel_map: VoxelMap, frames: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
         return jax.lax.scan(lambda carried, frame: fuse(carried, frame, params, key), voxel_map, frames)
 
-    def fuse_donated(log_odds: Array, rest: VoxelMap, *inputs: Any) -> tuple[VoxelMap, StepInfo]:
-        return fuse(replace(rest, log_odds=log_odds), *inputs)
+    def fuse_donated(tensors: _Tensors, rest: VoxelMap, *inputs: Any) -> tuple[VoxelMap, StepInfo]:
+        return fuse(replace(rest, **tensors._asdict()), *inputs)
 
-    # Only the tensor is donated: the small arrays of the grid may be shared with other maps.
+    # Only the tensors are donated: the small arrays of the grid may be shared with other maps.
     compiled: Any = jax.jit(fuse_donated, donate_argnums=0)
 
     def step(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
@@ -221,6 +251,13 @@ class _Observation(NamedTuple):
     plane: Plane | None
 
 
-def _apart(voxel_map: VoxelMap) -> tuple[Array, VoxelMap]:
-    """The tensor of a map, and the map without it."""
-    return voxel_map.log_odds, replace(voxel_map, log_odds=None)
+class _Tensors(NamedTuple):
+    """The large arrays of a map, by their names in it."""
+
+    log_odds: Array
+    members: Array | None
+
+
+def _apart(voxel_map: VoxelMap) -> tuple[_Tensors, VoxelMap]:
+    """The tensors of a map, and the map without them."""
+    return _Tensors(voxel_map.log_odds, voxel_map.members), replace(voxel_map, log_odds=None, members=None)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import jaxmap
+from jaxmap.ensemble.layer import named_layers
 from jaxmap.errors import JaxmapError
 from jaxmap.host_memory import peak_resident_mib
 from jaxmap.map_store import MapAttributes, save_map
@@ -16,7 +17,7 @@ from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json
 from jaxmap.report.html import write_report
 from jaxmap.run_folder import RunFolder, RunLog
-from jaxmap.run_outputs import count_voxels, write_exports, write_key_frame, write_poses
+from jaxmap.run_outputs import count_missed, count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.types import VoxelMap
 
@@ -56,7 +57,12 @@ def run_plan(
         tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
     saved_s = resumed_s = time.perf_counter()
     frames = prepare_frames(
-        plan.sequence, plan.front_end, plan.label_folder, needs=plan.labeller.needs, first=log.next_index
+        plan.sequence,
+        plan.front_end,
+        plan.label_folder,
+        needs=plan.labeller.needs,
+        pose_errors=plan.pose_errors,
+        first=log.next_index,
     )
     run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict)
     try:
@@ -72,12 +78,12 @@ def run_plan(
             on_frame(fused)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
-                save_map(folder.map, voxel_map, _attributes(plan, log))
+                save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == len(log.fused) > 0:
-            save_map(folder.map, voxel_map, _attributes(plan, log))
+            save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     log.total_s += time.perf_counter() - resumed_s
@@ -85,7 +91,7 @@ def run_plan(
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    attributes = _attributes(plan, log)
+    attributes = _attributes(plan, log, voxel_map)
     save_map(folder.map, voxel_map, attributes)
     fused_names = set(log.fused)
     fused_frames = np.array([frame.name in fused_names for frame in plan.sequence.frames])
@@ -94,7 +100,7 @@ def run_plan(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
     write_exports(folder, voxel_map, attributes)
-    metrics = _metrics(plan, log, voxel_map)
+    metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map)
     write_json(folder.metrics, metrics)
     write_report(folder.path)
     if not metrics["voxels"]["occupied"]:
@@ -120,6 +126,7 @@ def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
         and voxel_map.classes == plan.labeller.classes
         and np.array_equal(voxel_map.grid.origin_m, plan.grid.origin_m)
         and np.array_equal(voxel_map.grid.voxel_size_m, plan.grid.voxel_size_m)
+        and (0 if voxel_map.members is None else len(voxel_map.members)) == plan.members
     )
     if not (same_frames and same_grid):
         raise JaxmapError(
@@ -130,7 +137,7 @@ def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
     return saved
 
 
-def _attributes(plan: Plan, log: RunLog) -> MapAttributes:
+def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
     log.digest = plan.digest(log.next_index)
     return MapAttributes(
         crs=plan.sequence.crs,
@@ -138,6 +145,7 @@ def _attributes(plan: Plan, log: RunLog) -> MapAttributes:
         T_world_source=plan.sequence.T_world_source,
         fusion=plan.fusion,
         progress=log.as_json(),
+        layers=named_layers(voxel_map, plan.params.fusion, plan.rule),
     )
 
 
@@ -198,6 +206,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
         "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),
         "memory": {
             "map_mib": round(voxel_map.log_odds.nbytes / 2**20, 2),
+            **({"members_mib": round(members.nbytes / 2**20, 2)} if (members := voxel_map.members) is not None else {}),
             "step_temporary_mib": round(log.temporary_bytes / 2**20, 2),
             "peak_resident_mib": round(peak_resident_mib(), 1),
         },

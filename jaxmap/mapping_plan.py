@@ -11,13 +11,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from jaxmap.config import GridConfig, MapConfig, Triple, split_fusion
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.deeplab_labeller import make_deeplab_labeller
+from jaxmap.ensemble.draws import draw_ensemble
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.files import bundled
 from jaxmap.fusion.params import FusionRule, make_fusion_params
@@ -64,6 +65,13 @@ class Plan:
     fusion: dict[str, Any]
     mapper: Mapper
     key: PRNGKeyArray
+    pose_errors: Float[np.ndarray, "N M 6"] | None = None
+    """Of the members of an ensemble, for each frame."""
+
+    @property
+    def members(self) -> int:
+        """How many members the ensemble has."""
+        return 0 if self.pose_errors is None else self.pose_errors.shape[1]
 
     @property
     def key_frames(self) -> set[int]:
@@ -139,13 +147,15 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         grid = _grid(config, sequence, front_end, max_depth_m, len(labeller.classes))
         params, rule = split_fusion(config.fusion, labeller.classes)
         fusion_rule = FusionRule(**rule)
-        mapper_params = MapperParams(camera, make_fusion_params(labeller.classes, **params), labeller.params)
-    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
-    tell(
-        f"depth {depth_range_m[0]:g} to {max_depth_m:g} m; grid {' x '.join(map(str, grid.shape))} voxels of {size} m, "
-        f"{1 + len(labeller.classes)} channels: {map_bytes(grid, len(labeller.classes)) / 2**20:.0f} MiB"
-    )
-    check_memory(grid, len(labeller.classes), config.grid.max_memory_gib)
+        fusion_params = make_fusion_params(labeller.classes, **params)
+        members = _members(config, fusion_rule, labeller.classes)
+    tell(_told_grid(grid, depth_range_m, len(labeller.classes), members))
+    check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
+    key = jax.random.key(config.seed)
+    ensemble, pose_errors = None, None
+    if members:
+        timestamps_s = np.array([frame.timestamp_s for frame in sequence.frames], np.float64)
+        ensemble, pose_errors = draw_ensemble(key, fusion_params, timestamps_s, config.ensemble)
 
     return Plan(
         source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
@@ -157,11 +167,39 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         grid=grid,
         depth_range_m=depth_range_m,
         rule=fusion_rule,
-        params=mapper_params,
-        fusion={"params": params, "rule": rule},
-        mapper=make_mapper(camera, grid, labeller, fusion_rule, depth_range_m),
-        key=jax.random.key(config.seed),
+        params=MapperParams(camera, fusion_params, labeller.params, ensemble),
+        fusion={"params": params, "rule": rule} | ({"ensemble": asdict(config.ensemble)} if members else {}),
+        mapper=make_mapper(camera, grid, labeller, fusion_rule, depth_range_m, members=members),
+        key=key,
+        pose_errors=pose_errors,
     )
+
+
+def _told_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
+    """One line on what is mapped, and the memory it takes."""
+    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
+    return (
+        f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
+        f"{size} m, {1 + class_count} channels{f' and {members} members of 2' if members else ''}: "
+        f"{map_bytes(grid, class_count, members) / 2**20:.0f} MiB"
+    )
+
+
+def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int:
+    """How many members the ensemble has.
+
+    Raises:
+        UsageError: the map has no class that it could be asked about.
+    """
+    members = config.ensemble.members
+    if members and rule.target(classes) is None:
+        known = f"its classes are {' '.join(classes)}" if classes else "it has no class at all"
+        raise UsageError(
+            f"an ensemble tells where the map misses a priority class, and the map has none: {known}",
+            where="ensemble.members",
+            fix="name a class with --fusion.priority-classes, or leave the ensemble out",
+        )
+    return members
 
 
 @contextmanager
@@ -253,7 +291,8 @@ def _grid(
     grids = (_grid_of(config.grid, size_m, sequence, front_end, max_depth_m) for size_m in DEFAULT_VOXELS_M)
     limit_bytes = config.grid.max_memory_gib * 2**30
     coarsest = _grid_of(config.grid, DEFAULT_VOXELS_M[-1], sequence, front_end, max_depth_m)
-    return next((grid for grid in grids if map_bytes(grid, class_count) <= limit_bytes), coarsest)
+    members = config.ensemble.members
+    return next((grid for grid in grids if map_bytes(grid, class_count, members) <= limit_bytes), coarsest)
 
 
 def _grid_of(

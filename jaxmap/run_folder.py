@@ -93,6 +93,7 @@ class RunFolder:
         self.ply = path / "map.ply"
         self.geotiff = path / "bev.tif"
         self.picture = path / "bev.png"
+        self.missed = path / "missed.png"
         self.metrics = path / "metrics.json"
         self.config = path / "config.yaml"
         self.poses = path / "poses.tum"
@@ -131,7 +132,8 @@ class RunFolder:
         report = self.path / "report.html"
         # Scores are of the map that is there: they go with it.
         scored = (self.scores, self.errors)
-        return (self.ply, self.geotiff, self.picture, self.metrics, self.poses, report, self.config, *scored)
+        derived = (self.ply, self.geotiff, self.picture, self.missed)
+        return (*derived, self.metrics, self.poses, report, self.config, *scored)
 
     def check_apart(self, plan: Plan, config: MapConfig) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
@@ -166,7 +168,7 @@ class RunFolder:
         """
         if not holds_map(self.map):
             return None
-        voxel_map, attributes = load_map(self.map)
+        voxel_map, attributes = load_map(self.map, members=True)
         return voxel_map, RunLog(**attributes.progress)
 
     def _clear(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmap.datasets.pose_files import read_poses, write_tum
+from jaxmap.ensemble.layer import stored_layers
 from jaxmap.export.geotiff import write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
@@ -17,6 +18,7 @@ from jaxmap.files import atomic_path
 from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
 from jaxmap.map_store import MapAttributes
+from jaxmap.report.missed_plan import missed_picture
 from jaxmap.report.pictures import colourise_disparity, overlay_labels, top_down_picture
 from jaxmap.run_folder import RunFolder
 from jaxmap.stereo.front_end import RectifiedFrame
@@ -52,20 +54,32 @@ EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.p
 
 def write_exports(
     folder: RunFolder, voxel_map: VoxelMap, attributes: MapAttributes, formats: Sequence[str] = tuple(EXPORTS)
-) -> None:
-    """Writes the map in other forms; the picture shows the path of poses.tum, where there is one."""
+) -> list[str]:
+    """Writes the map in other forms, and returns the names of the files.
+
+    The pictures show the path of poses.tum, where there is one. Of a map with an ensemble there is another picture,
+    of what it may have missed.
+    """
+    written = [EXPORTS[name] for name in EXPORTS if name in formats]
     params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
     if "ply" in formats:
         write_ply(folder.ply, occupied_voxels(voxel_map, params, rule), voxel_map.classes, attributes.site_origin)
     top: TopDown = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
     if "geotiff" in formats:
-        write_geotiff(folder.geotiff, top, voxel_map.grid, voxel_map.classes, attributes.crs, attributes.site_origin)
+        where = (attributes.crs, attributes.site_origin)
+        write_geotiff(folder.geotiff, top, voxel_map.grid, voxel_map.classes, *where, layers=attributes.layers)
     if "png" in formats:
         path_world = None
         if folder.poses.exists():
             path_world = read_poses(folder.poses).T[:, :3, 3] - attributes.site_origin
         grid, placed = voxel_map.grid, attributes.crs is not None
         top_down_picture(top, grid, voxel_map.classes, path_world, folder.picture, georeferenced=placed)
+        target = rule.target(voxel_map.classes)
+        ensemble = stored_layers(attributes.layers, target, folder.map)
+        if ensemble is not None and target is not None:
+            missed_picture(ensemble, target, top, grid, path_world, folder.missed, georeferenced=placed)
+            written.append(folder.missed.name)
+    return written
 
 
 def count_voxels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> dict[str, Any]:
@@ -77,6 +91,26 @@ def count_voxels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) ->
         "occupied": int(solid.sum()),
         "free": int((seen & ~solid).sum()),
         "by_class": {name: int(labels[index]) for index, name in enumerate(voxel_map.classes)},
+    }
+
+
+def count_missed(rule: FusionRule, attributes: MapAttributes, voxel_map: VoxelMap) -> dict[str, Any]:
+    """What the ensemble expects the map to have missed; nothing where there is no ensemble."""
+    target = rule.target(voxel_map.classes)
+    layers = stored_layers(attributes.layers, target, "map")
+    if layers is None or voxel_map.members is None:
+        return {}
+    missed = np.asarray(layers.missed, np.float64)
+    column_m2 = float(np.prod(np.asarray(voxel_map.grid.voxel_size_m, np.float64)[:2]))
+    return {
+        "ensemble": {
+            "class": target,
+            "members": len(voxel_map.members),
+            "missed_area_expected_m2": round(float(np.nansum(missed)) * column_m2, 4),
+            "called_area_m2": round(int(layers.called().sum()) * column_m2, 4),
+            "observed_area_m2": round(int(np.isfinite(missed).sum()) * column_m2, 4),
+            "greatest_missed_probability": round(float(np.nanmax(missed, initial=0.0)), 4),
+        }
     }
 
 

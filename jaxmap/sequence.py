@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import PRNGKeyArray
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
 
 from jaxmap.datasets.base import FrameRef, StereoSequence
 from jaxmap.datasets.images import as_rgb
@@ -56,6 +57,7 @@ def prepare_frames(
     label_folder: LabelFolder | None = None,
     *,
     needs: Needs | None = None,
+    pose_errors: Float[np.ndarray, "N M 6"] | None = None,
     first: int = 0,
     workers: int = 2,
     ahead: int = 4,
@@ -68,6 +70,7 @@ def prepare_frames(
         label_folder: where each frame's labels lie, for the `files` labeller.
         needs: what the labeller asks of each frame (`Labeller.needs`); the rectified left image is delivered,
             as RGB, where it is `image`.
+        pose_errors: of the members of an ensemble, for each frame.
         first: index of the first frame.
         workers: threads.
         ahead: frames in the making or waiting, which bounds the memory.
@@ -85,16 +88,18 @@ def prepare_frames(
             stages_s = {"read": time.perf_counter() - started_s}
             rectified = front_end(pair.left, pair.right)
             stages_s |= {"rectify": rectified.rectify_s, "match": rectified.match_s}
-            labelling: dict[str, Any] = {}
+            filled: dict[str, Any] = {}
             if needs == "image":
                 # All as RGB: a grey image between coloured ones must not change the form of a frame.
-                labelling["image"] = jnp.asarray(as_rgb(rectified.left))
+                filled["image"] = jnp.asarray(as_rgb(rectified.left))
             if label_folder is not None:
                 started_s = time.perf_counter()
-                labelling |= label_folder.read(ref, front_end)
+                filled |= label_folder.read(ref, front_end)
                 stages_s["labels"] = time.perf_counter() - started_s
+            if pose_errors is not None:
+                filled["pose_errors"] = jnp.asarray(pose_errors[index], jnp.float32)
             pose = jaxlie.SE3.from_matrix(jnp.asarray(T_world_camera[index], jnp.float32))
-            frame = Frame(jnp.asarray(rectified.disparity_px), pose, **labelling)
+            frame = Frame(jnp.asarray(rectified.disparity_px), pose, **filled)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)

@@ -87,8 +87,9 @@ class Frame:
     """One stereo frame, ready for the compiled step.
 
     `disparity_px` is NaN where the matcher found nothing; `image` is the rectified left one, grey or RGB. The
-    last three are present only where the labeller asks for them, so that every frame of a sequence has the
-    same structure.
+    next three are present only where the labeller asks for them, so that every frame of a sequence has the
+    same structure; `pose_errors` are those of the members of an ensemble, where there is one
+    (`ensemble.draws.draw_pose_errors`).
     """
 
     disparity_px: Float[Array, "H W"]
@@ -96,6 +97,7 @@ class Frame:
     image: UInt8[Array, "H W *rgb"] | None = None
     labels: UInt8[Array, "H W"] | None = None
     class_probabilities: Float[Array, "H W C"] | None = None
+    pose_errors: Float[Array, "M 6"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -147,16 +149,18 @@ class VoxelMap:
 
     Channel 0 is occupancy, channel `1 + c` is class `c`. A voxel that nothing has touched holds
     exact zeros; priors are added when the map is read (`fusion.query`), so that maps can be summed.
+    `members` are those of an ensemble (`ensemble.members`), two channels each, where there is one.
     """
 
     log_odds: Float[Array, "K X Y Z"]
     frames_fused: Int[Array, ""]
     grid: GridSpec
     classes: tuple[str, ...] = field(metadata=_static())
+    members: Float[Array, "M 2 X Y Z"] | None = None
 
 
-def make_voxel_map(grid: GridSpec, classes: Sequence[str]) -> VoxelMap:
-    """An empty map.
+def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0) -> VoxelMap:
+    """An empty map, with as many members of an ensemble.
 
     Raises:
         JaxmapError: the tensor would have more elements than a 32-bit index can reach.
@@ -173,6 +177,7 @@ def make_voxel_map(grid: GridSpec, classes: Sequence[str]) -> VoxelMap:
         frames_fused=jnp.zeros((), jnp.int32),
         grid=grid,
         classes=tuple(classes),
+        members=jnp.zeros((members, 2, *grid.shape), jnp.float32) if members else None,
     )
 
 

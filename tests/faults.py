@@ -222,6 +222,12 @@ MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "matrix of another size": (2, with_yaml("fusion: {class_increments: [[1, 0], [0, 1]]}\n")),
     "penalties the wrong way round": (2, with_words("--stereo.p1", "9", "--stereo.p2", "3")),
     "too large a map": (1, with_words("--grid.max-memory-gib", "1e-4", "--grid.voxel-size-m", "0.1")),
+    "too many members": (
+        1,
+        with_words("--grid.max-memory-gib", "1e-3", "--grid.voxel-size-m", "0.1", "--ensemble.members", "40"),
+    ),
+    "an ensemble without a class": (2, with_words("--ensemble.members", "2", "--labeller", "none")),
+    "an ensemble of a spread below zero": (2, with_words("--ensemble.heading-sigma-rad", "-1")),
     "bounds the wrong way round": (2, with_words("--grid.lower-m", "3", "0", "0")),
     "files without a folder": (2, with_words("--labeller", "files")),
     "no such folder of labels": (1, with_words("--labeller", "files", "--labels", "nowhere")),

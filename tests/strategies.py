@@ -10,6 +10,7 @@ import jaxlie
 import numpy as np
 from hypothesis import strategies as st
 
+from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.types import GridSpec, PointLabels, StereoCamera, VoxelMap, make_stereo_camera, make_voxel_map
 
@@ -19,6 +20,18 @@ POINTS = 64
 CLASSES = ROVER_CLASSES
 VOXEL_SIZES_M = st.sampled_from([0.25, 0.5, 1.0])
 """Powers of two: positions on such grids are exact in float32."""
+
+NO_SPREAD = EnsembleOptions(
+    members=3,
+    position_sigma_m=0.0,
+    heading_sigma_rad=0.0,
+    tilt_sigma_rad=0.0,
+    disparity_sigma_px=0.0,
+    increment_sigma=0.0,
+    temperature_sigma=0.0,
+    label_bias_sigma=0.0,
+)
+"""Members that doubt nothing."""
 
 BAD_NUMBERS = (np.nan, np.inf, -np.inf, 1e30, -1e30, 3e9, -3e9)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from dataclasses import MISSING, asdict, fields
 
 import numpy as np
@@ -24,6 +25,7 @@ from jaxmap.config import (
     split_fusion,
 )
 from jaxmap.deeplab_labeller import make_deeplab_labeller
+from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import UsageError
 from jaxmap.files import config_folder
 from jaxmap.fusion.params import FusionRule, make_fusion_params
@@ -121,17 +123,15 @@ def test_the_defaults_of_the_plane_are_those_of_the_functions():
 
 
 def test_every_setting_has_a_default_and_says_what_it_is():
-    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, DeeplabConfig, StereoOptions):
+    sections = ("grid", "depth", "stereo", "fusion", "plane", "deeplab", "ensemble")
+    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, DeeplabConfig, StereoOptions, EnsembleOptions):
         source = inspect.getsource(kind)
         for field in fields(kind):
             assert field.default is not MISSING or field.default_factory is not MISSING, field.name
-            section = field.name in ("grid", "depth", "stereo", "fusion", "plane", "deeplab")
-            assert section or f"    {field.name}: " in source
-        described = source.count('    """') - 1
-        sections = sum(
-            field.name in ("grid", "depth", "stereo", "fusion", "plane", "deeplab") for field in fields(kind)
-        )
-        assert described == len(fields(kind)) - sections, kind.__name__
+            assert field.name in sections or f"    {field.name}: " in source
+        described = len(re.findall(r'^    """\S', source, re.MULTILINE)) - 1
+        told_apart = sum(field.name in sections for field in fields(kind))
+        assert described == len(fields(kind)) - told_apart, kind.__name__
 
 
 @pytest.mark.parametrize(

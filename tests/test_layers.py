@@ -24,11 +24,13 @@ FLOORS = {
     "jaxmap.models": 1,
     # 2: evidence
     "jaxmap.fusion": 2,
+    "jaxmap.ensemble": 2,
     # 3: the step and what feeds and keeps it
     "jaxmap.labellers": 3,
     "jaxmap.deeplab_labeller": 3,
     "jaxmap.mapper": 3,
     "jaxmap.datasets": 3,
+    "jaxmap.map_arrays": 3,
     "jaxmap.map_store": 3,
     "jaxmap.sequence": 3,
     # 4: what is built on maps
@@ -69,6 +71,8 @@ SAME_FLOOR = {
     ("jaxmap.types", "jaxmap.errors"),
     ("jaxmap.labels", "jaxmap.errors"),
     ("jaxmap.files", "jaxmap.errors"),
+    ("jaxmap.ensemble", "jaxmap.fusion"),
+    ("jaxmap.map_store", "jaxmap.map_arrays"),
     ("jaxmap.mapper", "jaxmap.labellers"),
     ("jaxmap.deeplab_labeller", "jaxmap.labellers"),
     ("jaxmap.sequence", "jaxmap.mapper"),

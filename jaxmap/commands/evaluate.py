@@ -11,7 +11,7 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.report.wording import SCORE_COLUMNS
+from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,9 @@ class EvaluateArguments:
     """Score the map of a run against ground truth seen from above.
 
     Cells count where the map observed a surface and the truth is labelled; the second row counts every labelled cell
-    in the cameras' view, with unobserved ones as not rock. Writes scores.json and errors.png (true, false and missed
-    rock in colours) into the run folder and its report, or --out and OUT_errors.png.
+    in the cameras' view, with unobserved ones as not rock. An ensemble (jaxmap map --ensemble.members) is scored by how
+    well it tells the missed cells among those not called rock. Writes scores.json and errors.png (true, false and
+    missed rock in colours) into the run folder and its report, or --out and OUT_errors.png.
     """
 
     run: tyro.conf.Positional[Path]
@@ -55,6 +56,7 @@ class EvaluateArguments:
 
 
 COLUMNS = {"over": "counted", **SCORE_COLUMNS}
+RANKING_COLUMNS = {"by": "missed, by", **MISSED_COLUMNS}
 
 
 def main(words: Sequence[str]) -> int:
@@ -132,6 +134,8 @@ def _print_scores(console: Console, scores: dict, title: str) -> None:
             f"turned {moved['heading_deg']:+.2f} degrees"
         )
     console.table(title, COLUMNS, [{key: _shown(row[key]) for key in COLUMNS} for row in rows])
+    if (ensemble := scores.get("ensemble")) is not None:
+        _print_ensemble(console, ensemble, scores["class"])
     rocks = [
         {"rocks": f"{heading} {_span(row)} m", "count": row["count"], "missed": row["missed"]}
         for key, heading in (("by_diameter_m", "diameter"), ("by_range_m", "nearest camera at"))
@@ -139,6 +143,15 @@ def _print_scores(console: Console, scores: dict, title: str) -> None:
     ]
     if rocks:
         console.table("rocks in view", {"rocks": "rocks", "count": "true", "missed": "missed"}, rocks)
+
+
+def _print_ensemble(console: Console, ensemble: dict, target: str) -> None:
+    title = (
+        f"of {ensemble['cells']:,} cells not called {target}, {ensemble['missed_cells']} are; "
+        f"the ensemble expected {ensemble['expected_missed_cells']:.1f}"
+    )
+    rows = [{"by": "the ensemble", **ensemble}, {"by": "the map alone", **ensemble["map_alone"]}]
+    console.table(title, RANKING_COLUMNS, [{key: _shown(row[key]) for key in RANKING_COLUMNS} for row in rows])
 
 
 def _span(row: dict) -> str:

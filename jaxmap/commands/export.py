@@ -14,7 +14,10 @@ from jaxmap.commands.console import Console, parse
 
 @dataclass(frozen=True)
 class ExportArguments:
-    """Write the map of a run as PLY (occupied voxels), GeoTIFF (view from above) or PNG."""
+    """Write the map of a run as PLY (occupied voxels), GeoTIFF (view from above) or PNG.
+
+    Where the run has an ensemble, the GeoTIFF holds its layers, and a second PNG shows what the map may have missed.
+    """
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
@@ -33,6 +36,5 @@ def main(words: Sequence[str]) -> int:
     folder = RunFolder(arguments.run)
     voxel_map, attributes = load_map(folder.map)
     formats = tuple(EXPORTS) if arguments.format == "all" else (arguments.format,)
-    write_exports(folder, voxel_map, attributes, formats)
-    Console().result(arguments.run, [EXPORTS[name] for name in formats])
+    Console().result(arguments.run, write_exports(folder, voxel_map, attributes, formats))
     return 0

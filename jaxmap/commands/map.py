@@ -25,7 +25,8 @@ class MapArguments:
     """Map a stereo sequence: images and poses in, a voxel map and its pictures out.
 
     Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
-    poses.tum, pictures/ and report.html.
+    poses.tum, pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and
+    bev.tif: the probability of a missed rock.
     """
 
     sequence: tyro.conf.Positional[str]
@@ -78,7 +79,7 @@ def main(words: Sequence[str]) -> int:
     console.tell(summary(metrics))
     for skipped in metrics["sequence"]["skipped"]:
         console.tell(f"skipped {skipped['frame']}: {skipped['reason']}")
-    console.result(arguments.out, OUTPUTS)
+    console.result(arguments.out, (*OUTPUTS, *(["missed.png"] if config.ensemble.members else [])))
     return 0
 
 

@@ -13,6 +13,7 @@ from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import CellGrid, MapCells, area_in_cells, column_shares, make_cells, map_cells
 from jaxmap.evaluation.map_scores import confusion_scores, count_confusion, score_cells
+from jaxmap.evaluation.ranking import ranking_scores, reliability
 from jaxmap.evaluation.registration import register, soft_iou
 from jaxmap.evaluation.rocks import find_rocks, rock_table
 from jaxmap.evaluation.truth_cells import Alignment, TruthCells, truth_cells
@@ -35,6 +36,7 @@ class ClassMap:
         observed: a surface was observed in the column.
         height_m: of that surface, world.
         prior: probability of the class where nothing was observed.
+        ensemble: probability of the class by an ensemble, NaN where nothing was observed; None without one.
         site_origin: where the world's origin lies in `crs`.
         crs: the coordinate reference system, or None.
     """
@@ -45,6 +47,7 @@ class ClassMap:
     observed: Bool[np.ndarray, "X Y"]
     height_m: Float[np.ndarray, "X Y"]
     prior: float = 0.5
+    ensemble: Float[np.ndarray, "X Y"] | None = None
     site_origin: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     crs: str | None = None
 
@@ -161,12 +164,46 @@ def evaluate_map(
         "max_range_m": options.max_range_m,
         "view_range_m": None if np.isinf(view_range_m) else float(view_range_m),
     }
+    if class_map.ensemble is not None:
+        missing = counted & ~called
+        expected = _ensemble_cells(class_map, class_map.ensemble, options.cell_size_m)[here]
+        scores["ensemble"] = missed_scores(expected[missing], np.asarray(said.share)[missing], truly[missing])
     if options.register:
         unmoved = before.truly(options.rock_fraction)
         scores["registration"] = _told(alignment) | {
             "before": _scores(said, called, unmoved, asked & before.labelled, in_view & before.labelled)
         }
     return Evaluation(scores, cells, observed, called, truly, counted, domain, truth, alignment)
+
+
+def missed_scores(
+    expected: Float[np.ndarray, "N"], share: Float[np.ndarray, "N"], truly: Bool[np.ndarray, "N"]
+) -> dict[str, Any]:
+    """How well an ensemble tells missed cells among those that the map does not call by the class.
+
+    Args:
+        expected: the share of each cell that is of the class, by the ensemble: its probability to be missed.
+        share: the same by the map alone, for comparison.
+        truly: cells that are of the class.
+    """
+    return {
+        "cells": len(truly),
+        "missed_cells": int(truly.sum()),
+        "expected_missed_cells": float(expected.sum(dtype=np.float64)),
+        **ranking_scores(expected, truly),
+        "reliability": reliability(expected, truly),
+        "map_alone": ranking_scores(share, truly),
+    }
+
+
+def _ensemble_cells(
+    class_map: ClassMap, probability: Float[np.ndarray, "X Y"], cell_size_m: float
+) -> Float[np.ndarray, "I J"]:
+    """The expected share of each cell that is of the class, by the ensemble; what was not observed is not."""
+    shares = column_shares(class_map.grid, make_cells(class_map.grid, cell_size_m))
+    columns = np.where(class_map.observed, probability, 0.0).astype(np.float32)
+    # The sums of areas such as 0.2 / 3 are not exact.
+    return (np.asarray(area_in_cells(shares, columns)) / shares.columns_per_cell).clip(0, 1)
 
 
 def _nothing_counted(asked: int, labelled: int, max_range_m: float | None, where: str) -> JaxmapError:

@@ -57,6 +57,10 @@ class FusionRule:
     priority_classes: tuple[str, ...] = ("rock",)
     column: Literal["max", "sum"] = "sum"
 
+    def target(self, classes: Sequence[str]) -> str | None:
+        """The class that cells are asked about first: the first priority class that is there."""
+        return next((name for name in self.priority_classes if name in classes), None)
+
     def __post_init__(self) -> None:
         """Refuses what no rule is called."""
         for name, choices in (("per_frame", ("sum", "once", "mean")), ("column", ("max", "sum"))):

@@ -44,35 +44,36 @@ def grid_around_views(
     return make_grid((np.floor(lower / size) * size).tolist(), (np.ceil(upper / size) * size).tolist(), size.tolist())
 
 
-def map_bytes(grid: GridSpec, class_count: int) -> int:
-    """Memory of a map's tensor, float32."""
+def map_bytes(grid: GridSpec, class_count: int, members: int = 0) -> int:
+    """Memory of a map's tensors, float32: channels for occupancy and each class, two for each member of an ensemble."""
     # Of Python integers: NumPy's would wrap round.
-    return 4 * (1 + class_count) * math.prod(grid.shape)
+    return 4 * (1 + class_count + 2 * members) * math.prod(grid.shape)
 
 
-def check_memory(grid: GridSpec, class_count: int, limit_gib: float) -> None:
-    """Refuses a map that would take more memory than allowed.
+def check_memory(grid: GridSpec, class_count: int, limit_gib: float, members: int = 0) -> None:
+    """Refuses a map, with the members of its ensemble, that would take more memory than allowed.
 
     Raises:
         JaxmapError: says what it would take and which voxel size would fit.
     """
     limit_bytes = limit_gib * 2**30
-    needed_bytes = map_bytes(grid, class_count)
+    needed_bytes = map_bytes(grid, class_count, members)
     if needed_bytes <= limit_bytes:
         return
     size_m = np.asarray(grid.voxel_size_m, np.float64)
     span_m = size_m * grid.shape
     # Rounded up to a centimetre, with a voxel to spare along each axis: what is advised must fit.
     fitting_m = np.ceil(size_m * (needed_bytes / limit_bytes) ** (1 / 3) * 100) / 100
-    while 4 * (1 + class_count) * np.prod(np.ceil(span_m / fitting_m) + 1) > limit_bytes:
+    while 4 * (1 + class_count + 2 * members) * np.prod(np.ceil(span_m / fitting_m) + 1) > limit_bytes:
         fitting_m = np.ceil(fitting_m * 1.05 * 100) / 100
     advice = " ".join(f"{edge:g}" for edge in (fitting_m[:1] if np.ptp(fitting_m) == 0 else fitting_m))
+    ensemble, fewer = (f" with {members} members", "fewer --ensemble.members, ") if members else ("", "")
     raise JaxmapError(
-        f"a map of {' x '.join(map(str, grid.shape))} voxels takes {_size_text(needed_bytes)}, "
+        f"a map of {' x '.join(map(str, grid.shape))} voxels{ensemble} takes {_size_text(needed_bytes)}, "
         f"over the limit of {_size_text(limit_bytes)}",
         where="grid",
         fix=f"take larger voxels (--grid.voxel-size-m {advice}), a shorter range (--depth.max-m), "
-        "or raise --grid.max-memory-gib",
+        f"{fewer}or raise --grid.max-memory-gib",
     )
 
 

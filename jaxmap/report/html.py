@@ -13,6 +13,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.files import atomic_path
 from jaxmap.report.inline import inline_image, script_text
+from jaxmap.report.missed_section import missed_section
 from jaxmap.report.page import page
 from jaxmap.report.run_contents import PICTURE_KINDS, RunContents, read_run
 from jaxmap.report.score_section import score_section
@@ -28,6 +29,7 @@ _FILES = {
     "map.ply": "occupied voxels, point cloud",
     "bev.tif": "view from above, GeoTIFF",
     "bev.png": "view from above, picture",
+    "missed.png": "where the map may have missed something, picture",
     "poses.tum": "poses of the left camera",
     "metrics.json": "all numbers of this page",
     "config.yaml": "the configuration",
@@ -51,6 +53,7 @@ def write_report(run: Path) -> Path:
     sections = [
         _header(folder, voxels),
         _from_above(folder, remarks),
+        missed_section(folder, remarks),
         score_section(folder.path, remarks),
         in_3d(folder, voxels),
         _key_frames(folder, remarks),

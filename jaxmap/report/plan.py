@@ -56,9 +56,9 @@ def top_down_picture(
     cell_m = np.asarray(grid.voxel_size_m, np.float64)[:2]
     origin_m = np.asarray(grid.origin_m, np.float64)[:2]
     colours = relief(top, cell_m, classes)
-    path_m = _finite(trajectory_world)
+    path_m = finite_path(trajectory_world)
     entries = _legend_entries(top, classes, colours, len(path_m) > 0)
-    box_m = _bounds(np.asarray(top.observed), origin_m, cell_m, path_m)
+    box_m = bounds_of(np.asarray(top.observed), origin_m, cell_m, path_m)
     layout = lay_out(*box_m, cell_m, entries, titled=bool(title), extra_legend_px=80 if colours.by_height else 0)
     figure = new_figure(layout)
     axes = map_axes(figure, layout, ("east, m", "north, m") if georeferenced else ("x, m", "y, m"))
@@ -85,14 +85,15 @@ def top_down_picture(
         FigureCanvasAgg(figure).print_png(temporary)
 
 
-def _finite(trajectory_world: Float[np.ndarray, "N 3"] | None) -> Float[np.ndarray, "M 2"]:
+def finite_path(trajectory_world: Float[np.ndarray, "N 3"] | None) -> Float[np.ndarray, "M 2"]:
+    """The points of a path that are finite, from above."""
     if trajectory_world is None:
         return np.zeros((0, 2))
     positions_m = np.asarray(trajectory_world, np.float64).reshape(-1, 3)
     return positions_m[np.isfinite(positions_m).all(axis=-1), :2]
 
 
-def _bounds(
+def bounds_of(
     observed: np.ndarray, origin_m: np.ndarray, cell_m: np.ndarray, path_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The box of whole cells around what was observed and the path within the map."""

@@ -40,12 +40,12 @@ def relief(top: TopDown, cell_size_m: Float[np.ndarray, "2"], classes: Sequence[
         base = colormaps[HEIGHT_COLOUR_MAP](scaled, bytes=True)[:, :3]
     else:
         base = class_colours(classes)[label[observed]]
-    shade = _shade(height_m, observed, cell_size_m)[observed]
+    shade = ground_shade(height_m, observed, cell_size_m)[observed]
     colours[observed] = np.rint(base * shade[:, None]).clip(0, 255)
     return Relief(colours, by_height, (float(low), float(high)))
 
 
-def _shade(
+def ground_shade(
     height_m: Float[np.ndarray, "X Y"], observed: Bool[np.ndarray, "X Y"], cell_size_m: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "X Y"]:
     """Brightness of lit ground, 1 where it is level."""

@@ -15,6 +15,7 @@ _TITLES = {
     "times": "Time",
     "points": "Points",
     "voxels": "Voxels",
+    "ensemble": "Ensemble",
     "memory": "Memory",
     "sequence": "Sequence",
 }

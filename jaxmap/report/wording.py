@@ -34,6 +34,15 @@ SCORE_COLUMNS = {
 }
 """Headings of the scores of a map, by their keys (DESIGN: Scores JSON)."""
 
+MISSED_COLUMNS = {
+    "auc": "ROC AUC",
+    "average_precision": "average precision",
+    "nll": "NLL",
+    "brier": "Brier",
+    "ece": "ECE",
+}
+"""Headings of the scores of an ensemble, by their keys."""
+
 
 def name_and_unit(key: str) -> tuple[str, str]:
     """What a key says: `peak_resident_mib` is "Peak resident" in "MiB"."""
