@@ -39,6 +39,7 @@ class Term(NamedTuple):
         disparity_sigma_px: of the disparity that the points were made of.
         groups: (M,), from 0; errors within a group are alike in part.
         group_worth: so many independent residuals a group is worth at most.
+        adapts: the noise is told from the residuals; else it is what was assumed.
     """
 
     linearise: Callable[[Rig], Linearised]
@@ -47,6 +48,7 @@ class Term(NamedTuple):
     disparity_sigma_px: float
     groups: np.ndarray
     group_worth: float
+    adapts: bool = True
 
 
 class Prior(NamedTuple):
@@ -139,7 +141,7 @@ def _prior_sigma(prior: Prior, frames: int) -> np.ndarray:
 
 def _noise_scale(term: Term, part: Linearised) -> float:
     """The variance of the residuals, in units of what was assumed, by their median."""
-    if not len(part.residual):
+    if not len(part.residual) or not term.adapts:
         return 1.0
     squares = _squares(term, part)
     return float(max(np.median(squares) / _CHI2_MEDIAN[part.residual.shape[1]], 0.05))

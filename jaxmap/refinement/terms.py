@@ -94,22 +94,29 @@ def _match_residual(step: Float[Array, "21"], setting: Setting, frames: Int[Arra
 
 
 class Surface(NamedTuple):
-    """A height field, as a grid and what it holds: heights less the origin's, and how well they are known (0: not)."""
+    """A field over the ground whose value at a point, plus the point's height times `rises`, is a residual.
+
+    Attributes:
+        grid: one voxel high.
+        fields: the values, and 1 where they are known, 0 elsewhere.
+        rises: 1 for heights (the field is the negative height), 0 for distances.
+    """
 
     grid: GridSpec
     fields: Float[Array, "2 X Y"]
+    rises: Float[Array, ""]
 
 
-def _height_residual(
+def _surface_residual(
     step: Float[Array, "15"], setting: Setting, frames: Int[Array, "1"], seen: Float[Array, "1 3"], surface: Surface
 ):
-    """Height of a point above a surface."""
+    """What a surface says of a point; nothing where it says nothing."""
     own, shared, more_px = step[:PER_FRAME], step[6:14], step[14]
     point = _world_from_camera(setting, frames[0], own, shared) @ _point(setting, seen[0], shared, more_px)
     # Sampled at the grid's own height, which holds whatever the point's is.
     place = point.at[2].set(surface.grid.origin_m[2] + 0.5 * surface.grid.voxel_size_m[2])
-    height, known = sample_columns(surface.grid, surface.fields, place[None])[:, 0]
-    return jnp.where(known > 0.99, point[2] - height, 0.0)[None]
+    value, known = sample_columns(surface.grid, surface.fields, place[None])[:, 0]
+    return jnp.where(known > 0.99, surface.rises * point[2] + value, 0.0)[None]
 
 
 @jax.jit
@@ -123,11 +130,11 @@ def _matches_at(setting: Setting, frames: Int[Array, "M 2"], seen: Float[Array, 
 
 
 @jax.jit
-def _heights_at(setting: Setting, frames: Int[Array, "M 1"], seen: Float[Array, "M 1 3"], surface: Surface):
+def _surface_at(setting: Setting, frames: Int[Array, "M 1"], seen: Float[Array, "M 1 3"], surface: Surface):
     def one(frames, seen):
         zero = jnp.zeros(PER_FRAME + SHARED + 1)
-        residual = _height_residual(zero, setting, frames, seen, surface)
-        return residual, jax.jacfwd(_height_residual)(zero, setting, frames, seen, surface)
+        residual = _surface_residual(zero, setting, frames, seen, surface)
+        return residual, jax.jacfwd(_surface_residual)(zero, setting, frames, seen, surface)
 
     return jax.vmap(one)(frames, seen)
 
@@ -146,7 +153,7 @@ def linearise(setting: Setting, frames: np.ndarray, seen: np.ndarray, surface: S
     for first in range(0, count, CHUNK):
         rows = np.arange(first, first + CHUNK).clip(max=count - 1)
         part = jnp.asarray(frames[rows], jnp.int32), jnp.asarray(seen[rows], jnp.float32)
-        found = _matches_at(setting, *part) if surface is None else _heights_at(setting, *part, surface)
+        found = _matches_at(setting, *part) if surface is None else _surface_at(setting, *part, surface)
         residual, slope = (np.asarray(one, np.float64)[: count - first] for one in found)
         residuals.append(residual)
         slopes.append(slope)

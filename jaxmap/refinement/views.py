@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from jaxmap.types import StereoCamera
 
 EDGE_PX = 2.0
-"""Disparities that differ by more within a patch lie on two surfaces."""
+"""Disparities that differ by more within a few pixels lie on two surfaces."""
 
 
 class View(NamedTuple):
@@ -38,6 +38,12 @@ def make_view(image: np.ndarray, disparity_px: np.ndarray) -> View | None:
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     assert isinstance(nearest, np.ndarray)
     return View(grey, np.where(known, disparity_px, np.nan).astype(np.float32), disparity_px[tuple(nearest)])
+
+
+def smooth_pixels(view: View) -> Bool[np.ndarray, "H W"]:
+    """Pixels away from the edges of surfaces: at edges, matchers make up points between near and far."""
+    square = np.ones((9, 9), np.uint8)
+    return cv2.dilate(view.filled_px, square) - cv2.erode(view.filled_px, square) < EDGE_PX
 
 
 class Pinhole(NamedTuple):
