@@ -71,7 +71,11 @@ def inside_grid(grid: GridSpec, points_world: Float[Array, "N 3"]) -> Bool[Array
 
 
 def _splat(
-    grid: GridSpec, points: Float[Array, "N 3"], values: Float[Array, "C N"], keep: Bool[Array, "N"], axes: Sequence[int]
+    grid: GridSpec,
+    points: Float[Array, "N 3"],
+    values: Float[Array, "C N"],
+    keep: Bool[Array, "N"],
+    axes: Sequence[int],
 ) -> Float[Array, "C *cells"]:
     with jax.named_scope("soft_splat"):
         keep = keep & inside_grid(grid, points) & jnp.isfinite(values).all(axis=0)

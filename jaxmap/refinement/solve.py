@@ -76,14 +76,14 @@ class Solution(NamedTuple):
         rig: the refined rig.
         covariance: (n, n) of `displacement`, zero where a number is held fixed.
         prior_sigma: (n,), as given or estimated.
-        cost: of the data and the prior, at every step, the first before any.
+        residuals_px: the median distance of matches (the first term's), before the first step and after each.
         noise_scales: for each term, its residuals in units of what was assumed.
     """
 
     rig: Rig
     covariance: np.ndarray
     prior_sigma: np.ndarray
-    cost: list[float]
+    residuals_px: list[float]
     noise_scales: list[float]
 
 
@@ -93,7 +93,7 @@ def solve(rig: Rig, given: Rig, terms: Sequence[Term], prior: Prior, steps: int 
     Args:
         rig: where to begin.
         given: what the prior is about.
-        terms: the residuals.
+        terms: the residuals, those of matches first.
         prior: how far the rig may be from what was given.
         steps: at most so many.
 
@@ -102,15 +102,13 @@ def solve(rig: Rig, given: Rig, terms: Sequence[Term], prior: Prior, steps: int 
     """
     sigma = _prior_sigma(prior, len(given.T_world_nominal))
     free = sigma > 0
-    costs: list[float] = []
     damping, scales = 0.0, [1.0] * len(terms)
     parts = [term.linearise(rig) for term in terms]
+    residuals_px = [_median_px(parts[0])]
     for _ in range(steps):
         scales = [_noise_scale(term, part) for term, part in zip(terms, parts, strict=True)]
         normal, gradient, data_cost = _normal_equations(terms, parts, scales, len(sigma))
         away = displacement(rig, given)
-        if not costs:
-            costs.append(data_cost + _prior_cost(away, sigma, free))
         sigma = _estimated_sigma(prior, sigma, free, normal, gradient, away)
         before = data_cost + _prior_cost(away, sigma, free)
         step, covariance = _step(normal, gradient, away, sigma, free, damping)
@@ -123,12 +121,16 @@ def solve(rig: Rig, given: Rig, terms: Sequence[Term], prior: Prior, steps: int 
                 break
             continue
         rig, parts, damping = candidate, candidate_parts, damping / 10
-        costs.append(after)
+        residuals_px.append(_median_px(parts[0]))
         if (np.abs(step[free]) < CONVERGED * np.sqrt(np.diag(covariance)[free])).all():
             break
     normal, gradient, _ = _normal_equations(terms, parts, scales, len(sigma))
     _, covariance = _step(normal, gradient, displacement(rig, given), sigma, free, 0.0)
-    return Solution(rig, covariance, sigma, costs, scales)
+    return Solution(rig, covariance, sigma, residuals_px, scales)
+
+
+def _median_px(part: Linearised) -> float:
+    return float(np.median(np.hypot(part.residual[:, 0], part.residual[:, 1]))) if len(part.residual) else 0.0
 
 
 def _prior_sigma(prior: Prior, frames: int) -> np.ndarray:
@@ -204,7 +206,9 @@ def _normal_equations(
             normal[np.ix_(numbers, numbers)] += stacked.T @ stacked
             gradient[numbers] += stacked.T @ white[rows_of].reshape(-1)
     if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
-        raise JaxmapError("the refinement diverges: residuals are not finite", fix="check the poses and the calibration")
+        raise JaxmapError(
+            "the refinement diverges: residuals are not finite", fix="check the poses and the calibration"
+        )
     return normal, gradient, _cost(terms, parts, scales)
 
 
@@ -225,7 +229,12 @@ def _step(
 
 
 def _estimated_sigma(
-    prior: Prior, sigma: np.ndarray, free: Bool[np.ndarray, "n"], normal: np.ndarray, gradient: np.ndarray, away: np.ndarray
+    prior: Prior,
+    sigma: np.ndarray,
+    free: Bool[np.ndarray, "n"],
+    normal: np.ndarray,
+    gradient: np.ndarray,
+    away: np.ndarray,
 ) -> np.ndarray:
     """The errors of the given poses where they are to be told from the data, by expectation maximisation.
 

@@ -94,29 +94,22 @@ def _match_residual(step: Float[Array, "21"], setting: Setting, frames: Int[Arra
 
 
 class Surface(NamedTuple):
-    """A field over the ground whose value at a point, plus the point's height times `rises`, is a residual.
-
-    Attributes:
-        grid: one voxel high.
-        fields: the values, and 1 where they are known, 0 elsewhere.
-        rises: 1 for heights (the field is the negative height), 0 for distances.
-    """
+    """Heights over the ground: a grid one voxel high, and in its columns the height and 1 where it is known, else 0."""
 
     grid: GridSpec
     fields: Float[Array, "2 X Y"]
-    rises: Float[Array, ""]
 
 
 def _surface_residual(
     step: Float[Array, "15"], setting: Setting, frames: Int[Array, "1"], seen: Float[Array, "1 3"], surface: Surface
 ):
-    """What a surface says of a point; nothing where it says nothing."""
+    """Height of a point above a surface; nothing where the surface is not known."""
     own, shared, more_px = step[:PER_FRAME], step[6:14], step[14]
     point = _world_from_camera(setting, frames[0], own, shared) @ _point(setting, seen[0], shared, more_px)
     # Sampled at the grid's own height, which holds whatever the point's is.
     place = point.at[2].set(surface.grid.origin_m[2] + 0.5 * surface.grid.voxel_size_m[2])
-    value, known = sample_columns(surface.grid, surface.fields, place[None])[:, 0]
-    return jnp.where(known > 0.99, surface.rises * point[2] + value, 0.0)[None]
+    height, known = sample_columns(surface.grid, surface.fields, place[None])[:, 0]
+    return jnp.where(known > 0.99, point[2] - height, 0.0)[None]
 
 
 @jax.jit
