@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +45,10 @@ DEPTH_SIGMA_M = 0.35
 
 @dataclass(frozen=True)
 class GroundFiles:
-    """What is known of the ground: a labelled orthomosaic or lists of rocks, an elevation model, the cameras' height."""
+    """What is known of the ground: labelled orthomosaic or lists of rocks, elevation model, height of the cameras."""
 
     truth: tuple[Path, ...] = ()
-    truth_options: TruthOptions = TruthOptions()
+    truth_options: TruthOptions = field(default_factory=TruthOptions)
     heights: Path | None = None
     below_camera_m: float | None = None
 

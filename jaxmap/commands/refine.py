@@ -24,8 +24,8 @@ class RefineArguments:
     Patches of the ground are matched between frames, and a least-squares problem makes frames, points and priors agree.
     What frames cannot tell by themselves (where the map as a whole lies; the camera's height) stays as given, unless
     --dem or --ground-truth ties the map to the ground; report.html says what could be told. Writes poses.tum (for
-    jaxmap map --poses), refine.json, report.html, its pictures, and calibration.yaml (for jaxmap map --calibration) where
-    mounting, baseline or offset were refined.
+    jaxmap map --poses), refine.json, report.html, its pictures, and calibration.yaml (for jaxmap map --calibration)
+    where mounting, baseline or offset were refined.
     """
 
     sequence: tyro.conf.Positional[str]
@@ -36,9 +36,11 @@ class RefineArguments:
     """What may be wrong: poses (each by itself), mounting (the same displacement of the camera in every frame),
     baseline, offset (of disparity)."""
     ground_truth: tuple[Path, ...] = ()
-    """A labelled orthomosaic (GeoTIFF: 0 unlabelled, 1 sand, 2 rock) or lists of rocks: where the rocks are, to some 0.1 m."""
+    """A labelled orthomosaic (GeoTIFF: 0 unlabelled, 1 sand, 2 rock) or lists of rocks: tells the place of the map to
+    some 0.1 m."""
     dem: Path | None = None
-    """An elevation model (GeoTIFF, metres, the height system of the poses): place, height and attitude to centimetres."""
+    """An elevation model (GeoTIFF, metres, the height system of the poses): tells place, height and attitude to
+    centimetres and tenths of a degree."""
     ground_below_camera_m: float | None = None
     """How far below the given camera poses the ground lies that the rover drives over, by its drawings (Katwijk's
     LocCam: 1.10): tells an error of the mounting's height from the height that the cameras see."""
@@ -172,9 +174,9 @@ def _check(arguments: RefineArguments) -> None:
 def _print(console: Console, content: dict[str, Any]) -> None:
     spread, residual, matches = content["map_height_spread_m"], content["match_residual_px"], content["matches"]
     console.tell(
-        f"{matches['count']:,} matches in {matches['pairs']} pairs of frames, off by {residual['before']:.2f} px before "
-        f"and {residual['after']:.2f} px now; heights differ by {100 * spread['before']:.1f} cm between frames before and "
-        f"{100 * spread['after']:.1f} cm now"
+        f"{matches['count']:,} matches in {matches['pairs']} pairs of frames, off by {residual['before']:.2f} px "
+        f"before and {residual['after']:.2f} px now; between frames heights differ by {100 * spread['before']:.1f} cm "
+        f"before and {100 * spread['after']:.1f} cm now"
     )
     for note in content["notes"]:
         console.tell(f"note: {note}")

@@ -123,7 +123,7 @@ def read_camera_yaml(path: Path) -> StereoCamera | StereoRig:
 
 
 def read_mounting(path: Path) -> Float64[np.ndarray, "4 4"]:
-    """T_nominal_camera, where a calibration says that the left camera sits otherwise than its poses assume; else identity.
+    """T_nominal_camera: where the left camera sits, if otherwise than its poses assume; else identity.
 
     Moves poses that were derived for the nominal camera: `T_world_camera = T_world_nominal @ T_nominal_camera`::
 

@@ -1,7 +1,7 @@
 """What ties a map to the ground: heights of an elevation model.
 
-Frames that agree with each other say nothing of where all of them are. An elevation model does: a point's height above it
-is a residual of its own. It tells height, roll and pitch, and by the relief of the ground place and heading too.
+Frames that agree with each other say nothing of where all of them are. An elevation model does: a point's height above
+it is a residual of its own. It tells height, roll and pitch, and by the relief of the ground place and heading too.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class Consistency(NamedTuple):
     """Standard deviations between the frames that see a column, over the columns that two or more see.
 
     Attributes:
-        height_m, brightness: the root of the mean variance.
+        height_m, brightness: the median over the columns; their mean would tell of the edges of rocks alone.
         spread_m: (X, Y) of the height in each column, NaN where fewer than two frames see it.
         grid: the columns, one voxel high.
     """
@@ -100,7 +100,7 @@ def consistency_of(
         for part in _between_frames(local, jnp.asarray(points, jnp.float32), jnp.asarray(values, jnp.float32))
     )
     several = count > 1
-    mean = variance[:, several].mean(axis=1) if several.any() else np.full(2, np.nan)
+    middle = np.median(variance[:, several], axis=1) if several.any() else np.full(2, np.nan)
     return Consistency(
-        float(np.sqrt(mean[0])), float(np.sqrt(mean[1])), np.where(several, np.sqrt(variance[0]), np.nan), grid
+        float(np.sqrt(middle[0])), float(np.sqrt(middle[1])), np.where(several, np.sqrt(variance[0]), np.nan), grid
     )

@@ -1,8 +1,8 @@
 """Where a map lies to an orthomosaic in which rocks are labelled: what rises from the ground belongs on the rocks.
 
-The points of all frames give the ground's relief in columns (by the soft splat). The labels are moved over it, shifted and
-turned, to where labelled rocks rise most above what is labelled otherwise. Only columns that were seen count, so that
-the far sides of rocks, which no camera saw, pull nothing.
+The points of all frames give the ground's relief in columns (by the soft splat). The labels are moved over it, shifted
+and turned, to where most that rises is labelled rock, and most that does not is not. Only columns that were seen count,
+so that the far sides of rocks, which no camera saw, pull nothing.
 """
 
 from __future__ import annotations

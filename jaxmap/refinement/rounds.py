@@ -200,8 +200,8 @@ def _tie(
             return
         alignment, sigma = placed
         state.notes.append(
-            f"by its rocks the map lies {np.hypot(*alignment.shift_m):.2f} m and {np.degrees(alignment.heading_rad):.1f} deg "
-            f"beside the labels, known to {sigma[0]:.2f} m and {np.degrees(sigma[2]):.1f} deg"
+            f"by its rocks the map lies {np.hypot(*alignment.shift_m):.2f} m and "
+            f"{np.degrees(abs(alignment.heading_rad)):.1f} deg beside the labels, known to {sigma[0]:.2f} m and {np.degrees(sigma[2]):.1f} deg"
         )
         _solve(state, "labelled rocks", [*terms, place_term(state.rig, alignment, sigma)], prior)
 

@@ -1,8 +1,9 @@
 """Robust least squares over the poses, the mounting and the calibration; and what the data say of each of them.
 
-The posterior of a rig is that of its priors (how wrong the given poses, the mounting, ... may be) and its terms (matches,
-heights), linearised: a Gauss-Newton step to its mode, held back by Levenberg's and Marquardt's damping where the step does
-not help, and the inverse of the normal matrix as its covariance. What the terms say nothing of keeps its prior.
+The posterior of a rig is that of its priors (how wrong the given poses, the mounting, ... may be) and its terms
+(matches, heights), linearised: a Gauss-Newton step to its mode, held back by Levenberg's and Marquardt's damping where
+the step does not help, and the inverse of the normal matrix as its covariance. What the terms say nothing of keeps its
+prior.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ ROBUST = 2.5
 """Residuals of more than so many sigma pull less and less (Cauchy's function)."""
 
 MAX_STEPS = 12
-CONVERGED = 1e-3
+CONVERGED = 0.02
 """Steps of less than this share of the posterior's sigma are the last."""
 
 _LEAST_POSITION_M, _LEAST_ANGLE_RAD = 1e-3, np.radians(0.01)
@@ -190,7 +191,7 @@ def _normal_equations(
     for term, part, scale in zip(terms, parts, scales, strict=True):
         if not len(part.residual):
             continue
-        count, rows, places, _ = part.by_frames.shape
+        count, rows = part.residual.shape
         local = np.concatenate([part.by_frames.reshape(count, rows, -1), part.by_shared], axis=-1)
         white, slope = _whiten(term, part, part.residual[..., None], local)
         limit = ROBUST**2 * rows
@@ -238,7 +239,7 @@ def _estimated_sigma(
 ) -> np.ndarray:
     """The errors of the given poses where they are to be told from the data, by expectation maximisation.
 
-    The variance of a group of numbers is the mean of their squares in the posterior: that of the mode and that around it.
+    The variance of a group of numbers is the mean of their squares in the posterior: of the mode, and around it.
     """
     frames = (len(sigma) - SHARED) // PER_FRAME
     kinds = [
