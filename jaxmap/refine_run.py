@@ -133,7 +133,8 @@ def ground_of(files: GroundFiles, inputs: RefineInputs, max_depth_m: float) -> t
     sequence = inputs.sequence
     track, origin = sequence.T_world_camera[:, :2, 3], sequence.site_origin
     lower, upper = track.min(axis=0) - max_depth_m, track.max(axis=0) + max_depth_m
-    place = Extent(*(float(value) for value in (*(lower + origin[:2]), *(upper + origin[:2]))), sequence.crs)
+    (west, south), (east, north) = lower + origin[:2], upper + origin[:2]
+    place = Extent(float(west), float(south), float(east), float(north), sequence.crs)
     heights = is_rock = None
     notes: list[str] = []
     if files.heights is not None:

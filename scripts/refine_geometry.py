@@ -4,10 +4,10 @@
 
 True poses are made wrong by 0.2 m and 1 degree in random directions, frame by frame, or all by 2 degrees of pitch and
 0.1 m of height in the camera's mounting; then they are refined, from the images alone and with what is known of the
-ground, and compared with the true ones. Errors are of all poses as they lie in the world, and once more after the path as a
-whole was shifted and turned about the vertical to the true one: what is left then is what bends the map. Last come the
-poses that the reader itself estimates, if it does. With --labels and --truth, maps with all these poses are scored: IoU
-of rock in cells of 0.2 m within 8 m of the camera.
+ground, and compared with the true ones. Errors are of all poses as they lie in the world, and once more after the path
+as a whole was shifted and turned about the vertical to the true one: what is left then is what bends the map. Last come
+the poses that the reader itself estimates, if it does. With --labels and --truth, maps with all these poses are scored:
+IoU of rock in cells of 0.2 m within 8 m of the camera.
 """
 
 from __future__ import annotations

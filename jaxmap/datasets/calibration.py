@@ -170,8 +170,8 @@ def write_camera_yaml(
         for side in ("left", "right"):
             K = getattr(camera, f"K_{side}")
             numbers = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-            tree[side] = {key: float(value) for key, value in zip(_RAW_CAMERA_KEYS[:4], numbers, strict=True)}
-            tree[side] |= {"distortion": getattr(camera, f"distortion_{side}").tolist()}
+            named = {key: float(value) for key, value in zip(_RAW_CAMERA_KEYS[:4], numbers, strict=True)}
+            tree[side] = {**named, "distortion": getattr(camera, f"distortion_{side}").tolist()}
         tree["R_right_left"] = camera.R_right_left.tolist()
         tree["t_right_left_m"] = camera.t_right_left_m.tolist()
         tree["doffs_px"] = float(camera.doffs_px)

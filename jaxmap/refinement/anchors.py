@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64, Int
 from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxmap.refinement.rig import Rig
 from jaxmap.refinement.solve import Term
@@ -128,5 +128,5 @@ def ground_contact(track_m: Float64[np.ndarray, "N 3"], below_m: float) -> Raste
     shape = np.ceil((track_m[:, :2].max(axis=0) + CONTACT_RADIUS_M - lower) / cell_m).astype(int)
     x, y = (lower[axis] + (np.arange(shape[axis]) + 0.5) * cell_m for axis in (0, 1))
     # Near a camera, the height of the nearest one; elsewhere nothing is known.
-    distance, nearest = cKDTree(track_m[:, :2]).query(np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
+    distance, nearest = KDTree(track_m[:, :2]).query(np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
     return Raster(np.where(distance < CONTACT_RADIUS_M, track_m[nearest, 2] - below_m, np.nan), lower, cell_m)

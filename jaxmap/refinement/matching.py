@@ -203,4 +203,4 @@ def _agreeing(seen_px: Float64[np.ndarray, "M 2 3"], camera: Pinhole, within_px:
         return None
     T_target_source = np.eye(4)
     T_target_source[:3, :3], T_target_source[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
-    return PairMatches(seen_px[np.sort(inliers.ravel())], T_target_source)
+    return PairMatches(seen_px[np.sort(np.asarray(inliers, np.int64).ravel())], T_target_source)

@@ -187,10 +187,11 @@ def _tie(
         terms = [*terms, height_term(shown, camera, contact, origin_m, DISPARITY_SIGMA_PX)]
         _solve(state, "ground under the rover", terms, prior)
     if ground.heights is not None:
+        untied = terms
         for blur_m in BLURS_M:
             tied = height_term(points, camera, ground.heights, origin_m, DISPARITY_SIGMA_PX, blur_m)
-            _solve(state, f"elevation model, smoothed over {blur_m:g} m", [*terms, tied], prior)
-        terms = [*terms, tied]
+            terms = [*untied, tied]
+            _solve(state, f"elevation model, smoothed over {blur_m:g} m", terms, prior)
         on_round(state)
     if ground.is_rock is not None:
         relief = relief_of(points_world(state.rig, camera, shown))
@@ -199,9 +200,10 @@ def _tie(
             state.notes.append("too little of the labelled rock is in view to place the map by it")
             return
         alignment, sigma = placed
+        off_m, turned_deg = np.hypot(*alignment.shift_m), np.degrees(abs(alignment.heading_rad))
         state.notes.append(
-            f"by its rocks the map lies {np.hypot(*alignment.shift_m):.2f} m and "
-            f"{np.degrees(abs(alignment.heading_rad)):.1f} deg beside the labels, known to {sigma[0]:.2f} m and {np.degrees(sigma[2]):.1f} deg"
+            f"by its rocks the map lies {off_m:.2f} m and {turned_deg:.1f} deg beside the labels, "
+            f"known to {sigma[0]:.2f} m and {np.degrees(sigma[2]):.1f} deg"
         )
         _solve(state, "labelled rocks", [*terms, place_term(state.rig, alignment, sigma)], prior)
 
