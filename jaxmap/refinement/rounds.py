@@ -15,7 +15,7 @@ from jaxmap.refinement.consistency import Consistency, consistency_of
 from jaxmap.refinement.pairs import MatchTable, Reach, match_chain, match_overlapping, table
 from jaxmap.refinement.relief import place, place_term, relief_of
 from jaxmap.refinement.rig import Rig, make_rig
-from jaxmap.refinement.solve import FIRST_ANGLE_RAD, FIRST_POSITION_M, Prior, Solution, Term, solve
+from jaxmap.refinement.solve import FIRST_ANGLE_RAD, FIRST_POSITION_M, MAX_STEPS, Prior, Solution, Term, solve
 from jaxmap.refinement.terms import linearise, make_setting
 from jaxmap.refinement.views import Pinhole, View, bilinear
 
@@ -29,7 +29,10 @@ RADII_PX = (12, 6)
 BLURS_M = (0.3, 0.1, 0.0)
 """An elevation model is smoothed, so that its rocks are found from as far away as the poses may be off."""
 
-POINTS_PER_FRAME, DENSE_PER_FRAME = 1500, 20_000
+POINTS_PER_FRAME, DENSE_PER_FRAME = 600, 20_000
+
+FEW_STEPS = 4
+"""Enough for a solution that is only the way to the next one."""
 
 
 class Ground(NamedTuple):
@@ -162,8 +165,8 @@ def _match_term(matches: MatchTable, camera: Pinhole, origin_m: np.ndarray) -> T
     )
 
 
-def _solve(state: Refinement, name: str, terms: list[Term], prior: Prior) -> None:
-    solution = solve(state.rig, state.given, terms, prior)
+def _solve(state: Refinement, name: str, terms: list[Term], prior: Prior, steps: int = MAX_STEPS) -> None:
+    solution = solve(state.rig, state.given, terms, prior, steps)
     state.rounds.append((len(state.residuals_px), name))
     state.residuals_px += solution.residuals_px
     state.solution = solution
@@ -191,7 +194,9 @@ def _tie(
         for blur_m in BLURS_M:
             tied = height_term(points, camera, ground.heights, origin_m, DISPARITY_SIGMA_PX, blur_m)
             terms = [*untied, tied]
-            _solve(state, f"elevation model, smoothed over {blur_m:g} m", terms, prior)
+            _solve(
+                state, f"elevation model, smoothed over {blur_m:g} m", terms, prior, FEW_STEPS if blur_m else MAX_STEPS
+            )
         on_round(state)
     if ground.is_rock is not None:
         relief = relief_of(points_world(state.rig, camera, shown))
