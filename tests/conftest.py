@@ -11,7 +11,7 @@ from jaxtyping import install_import_hook
 
 # `types`, `fusion.params` and `models.deeplab` stay out: JAX rebuilds their dataclasses with stacked arrays,
 # placeholders for leaves, and shapes without arrays.
-FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model")
+FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model", "fusion.splat")
 NETWORK_MODULES = tuple(
     f"models.{name}" for name in ("convolutions", "heads", "layers", "mobilenet_v2", "pixelwise", "resnet", "xception")
 )

@@ -37,6 +37,7 @@ FLOORS = {
     "jaxmap.training": 4,
     "jaxmap.tuning": 4,
     "jaxmap.evaluation": 4,
+    "jaxmap.refinement": 4,
     "jaxmap.simulation": 4,
     "jaxmap.export": 4,
     # 5: what is shown
@@ -58,6 +59,7 @@ FLOORS = {
     "jaxmap.mapping": 7,
     "jaxmap.mapping_plan": 7,
     "jaxmap.segmentation": 7,
+    "jaxmap.refine_run": 7,
     "jaxmap.map_evaluation": 7,
     "jaxmap.weight_files": 7,
     # 8: the command line
@@ -81,6 +83,7 @@ SAME_FLOOR = {
     ("jaxmap.config", "jaxmap.settings"),
     ("jaxmap.training_config", "jaxmap.settings"),
     ("jaxmap.training", "jaxmap.evaluation"),
+    ("jaxmap.refinement", "jaxmap.evaluation"),
     ("jaxmap.training_folder", "jaxmap.output_folder"),
     ("jaxmap.training_folder", "jaxmap.training_log"),
     ("jaxmap.training_folder", "jaxmap.training_plan"),
@@ -96,6 +99,8 @@ SAME_FLOOR = {
     ("jaxmap.run_folder", "jaxmap.mapping_plan"),
     ("jaxmap.mapping", "jaxmap.run_outputs"),
     ("jaxmap.map_evaluation", "jaxmap.run_folder"),
+    ("jaxmap.refine_run", "jaxmap.output_folder"),
+    ("jaxmap.refine_run", "jaxmap.map_evaluation"),
     ("jaxmap.cli", "jaxmap.commands"),
     ("jaxmap.__main__", "jaxmap.cli"),
 }

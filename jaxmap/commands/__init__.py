@@ -6,6 +6,7 @@ COMMANDS: dict[str, str] = {
     "demo": "map the bundled sample with every labeller and show what comes out",
     "map": "map a stereo sequence",
     "train": "train or fine-tune DeepLabv3+ on images and masks",
+    "refine": "refine poses, camera mounting and stereo calibration until frames agree",
     "evaluate": "score a map against an orthomosaic labelled from above",
     "segment": "label images with a network, and score the labels",
     "simulate": "render a traverse, or training images, of a simulated world",

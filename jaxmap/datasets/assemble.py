@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmap.datasets.base import FrameRef, StereoPair, StereoSequence
+from jaxmap.datasets.calibration import read_mounting
 from jaxmap.datasets.images import first_image_size_px, read_stereo_pair
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.datasets.poses import PosesWorld, PoseTrack, poses_at, split_site_origin, to_z_up, with_timestamps
@@ -28,7 +29,8 @@ class ReadOptions:
             alone), instead of the sequence's own.
         poses_world: the world of the poses: `z_up`, `camera` (x right, y down, z forward), or
             `auto` to tell by which way the cameras' up axes point.
-        calibration: a camera YAML, instead of the sequence's own calibration (Katwijk: or MATLAB's .mat).
+        calibration: a camera YAML, instead of the sequence's own calibration (Katwijk: or MATLAB's .mat). A mounting
+            that it holds moves the sequence's own poses; those of `poses` are of the camera as it is.
         camera: which stereo camera, where a data set has several; by default its first.
         antenna_m: where the GPS antenna is on the rover, in the data set's IMU frame, where poses come from GPS.
         start, stop, stride: which frames, as a Python slice of the frames on disk.
@@ -161,6 +163,8 @@ def assemble(
     T_source_camera = T_source_child[has_pose]
     if T_child_camera is not None:
         T_source_camera = T_source_camera @ (T_child_camera if T_child_camera.ndim == 2 else T_child_camera[has_pose])
+    if options.poses is None and options.calibration is not None and options.calibration.suffix.lower() != ".mat":
+        T_source_camera = T_source_camera @ read_mounting(options.calibration)
     T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
 

@@ -18,7 +18,8 @@ class StereoRig:
     """Calibration of a raw (distorted, unrectified) stereo pair, OpenCV's conventions.
 
     `x_right = R_right_left @ x_left + t_right_left_m`; pixel centres are integers (MATLAB's
-    principal points less 1); distortion is `k1 k2 p1 p2 [k3 [k4 k5 k6]]`.
+    principal points less 1); distortion is `k1 k2 p1 p2 [k3 [k4 k5 k6]]`. `doffs_px` is added to the
+    disparity offset that rectification leaves, for a pair that was found to be off by a constant.
     """
 
     K_left: np.ndarray
@@ -29,6 +30,7 @@ class StereoRig:
     t_right_left_m: np.ndarray
     width_px: int
     height_px: int
+    doffs_px: float = 0.0
 
 
 def make_stereo_rig(
@@ -40,6 +42,7 @@ def make_stereo_rig(
     R_right_left: ArrayLike,
     t_right_left_m: ArrayLike,
     size_px: tuple[int, int],
+    doffs_px: float = 0.0,
     where: object = "calibration",
 ) -> StereoRig:
     """Checks and builds a `StereoRig`; `size_px` is (width, height).
@@ -83,7 +86,9 @@ def make_stereo_rig(
     for side in ("K_left", "K_right"):
         if arrays[side][0, 0] <= 0 or arrays[side][1, 1] <= 0:
             raise JaxmapError(f"{side} has a focal length that is not positive", where=where)
-    return StereoRig(**arrays, width_px=int(size_px[0]), height_px=int(size_px[1]))
+    if not np.isfinite(doffs_px):
+        raise JaxmapError(f"doffs_px is {doffs_px}", where=where, fix="give a finite number")
+    return StereoRig(**arrays, width_px=int(size_px[0]), height_px=int(size_px[1]), doffs_px=float(doffs_px))
 
 
 class Rectifier(NamedTuple):
@@ -133,7 +138,7 @@ def make_rectifier(rig: StereoRig, alpha: float = 0.0) -> Rectifier:
         cx_px=P_left[0, 2],
         cy_px=P_left[1, 2],
         baseline_m=-P_right[0, 3] / P_right[0, 0],
-        doffs_px=P_right[0, 2] - P_left[0, 2],
+        doffs_px=P_right[0, 2] - P_left[0, 2] + rig.doffs_px,
         width_px=rig.width_px,
         height_px=rig.height_px,
         where="calibration (left and right swapped?)",
