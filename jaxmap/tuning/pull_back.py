@@ -1,7 +1,7 @@
 """Exact gradients of a score of the map, with memory that does not grow with the number of frames.
 
-Fusion is a sum: `map = sum_i evidence_i(params)`, so that `d loss / d params = sum_i (d evidence_i / d params)^T G` with
-one and the same `G = d loss / d map` for all frames. The map is made once, forward; `G` is taken; then every frame is
+Fusion is a sum: `map = sum_i evidence_i(params)`, so `d loss / d params = sum_i (d evidence_i / d params)^T G` with one
+and the same `G = d loss / d map` for all frames. The map is made once, forward; `G` is taken; then every frame is
 computed anew and pulls `G` back to the parameters, within its own window of the map. Plain reverse mode through the
 scan gives the same numbers, but keeps what every frame has computed until the last one is done.
 """
