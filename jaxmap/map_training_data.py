@@ -54,11 +54,13 @@ class CellTruth(NamedTuple):
 
     def of_points(self, points_world: Float[np.ndarray, "*s 3"]) -> UInt8[np.ndarray, "*s"]:
         """The class of the cells that points lie in, world; `IGNORE` where there is none."""
-        index = np.floor((points_world[..., :2] - np.array(self.cells.origin_m)) / self.cells.size_m)
-        inside = ((index >= 0) & (index < np.array(self.cells.shape))).all(axis=-1)
+        rows, columns = (
+            np.floor((points_world[..., axis] - self.cells.origin_m[axis]) / self.cells.size_m) for axis in (0, 1)
+        )
         # Tested on floats: a NaN cast to an integer would be a valid index.
-        i, j = np.moveaxis(np.where(inside[..., None], index, 0).astype(np.int64), -1, 0)
-        return np.where(inside, self.labels[i, j], np.uint8(IGNORE))
+        inside = (rows >= 0) & (rows < self.cells.shape[0]) & (columns >= 0) & (columns < self.cells.shape[1])
+        at = np.where(inside, rows, 0).astype(np.int64), np.where(inside, columns, 0).astype(np.int64)
+        return np.where(inside, self.labels[at], np.uint8(IGNORE))
 
 
 @dataclass(frozen=True)

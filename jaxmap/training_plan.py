@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 from jaxmap.errors import UsageError
 from jaxmap.models.architecture import Architecture
@@ -20,9 +19,10 @@ from jaxmap.training.batches import Order, Pixels, batches_from
 from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set
 from jaxmap.training.losses import class_weights
 from jaxmap.training.starts import Start, make_start
-from jaxmap.training.step import Batch, StepInfo, TrainState, make_trainer
+from jaxmap.training.step import Batch, Trainer, make_trainer
 from jaxmap.training.validation import Validation, Validator
 from jaxmap.training_config import TrainConfig
+from jaxmap.tuning.map_step import MapTrainer
 
 
 class Validates(Protocol):
@@ -72,20 +72,6 @@ class TrainingData(Protocol):
         ...
 
 
-class Stepper(Protocol):
-    """The functions of a trainer that a run needs: `training.step.Trainer`, `tuning.map_step.MapTrainer`."""
-
-    @property
-    def init(self) -> Callable[[Weights], TrainState]:
-        """The state that training begins with."""
-        ...
-
-    @property
-    def step(self) -> Callable[[TrainState, Any, PRNGKeyArray], tuple[TrainState, StepInfo]]:
-        """From a state, a batch and the run's key to the next state."""
-        ...
-
-
 class TrainingPlan(NamedTuple):
     """A run, decided in full.
 
@@ -103,7 +89,7 @@ class TrainingPlan(NamedTuple):
     start: Start
     init: Path | None
     order: Order
-    trainer: Stepper
+    trainer: Trainer | MapTrainer
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ class TrainingRun:
         if bool(info.finite):
             return
         order = self._plan.order
-        images = [self._plan.data.names[place // order.variants] for place in order.draws(step)[:, 1]]
+        images = [self._plan.data.names[int(place) // order.variants] for place in order.draws(step)[:, 1]]
         loss, norm = float(info.loss), float(info.gradient_norm)
         numbers = f"loss {loss:g}, gradient norm {norm:g}"
         raise JaxmapError(

@@ -36,10 +36,14 @@ class FrameBatch(NamedTuple):
 
 
 class FrameCrop(NamedTuple):
-    """A crop of a frame, and the camera that sees just this; what lies outside the image has no disparity."""
+    """A crop of a frame, and the camera that sees its disparity; what lies outside the image has none.
+
+    The disparity is finer than the image by `points_per_pixel`: the network may run small, and the map still gets all
+    the points.
+    """
 
     image: Float[Array, "h w 3"]
-    disparity_px: Float[Array, "h w"]
+    disparity_px: Float[Array, "fh fw"]
     anchors: UInt8[Array, "h w"]
     camera: StereoCamera
     T_world_camera: jaxlie.SE3
@@ -65,11 +69,17 @@ def crop_frame(
     size_px = jnp.array([camera.height_px, camera.width_px])
     view = draw_view(view_key, size_px, options)
     image, anchors = cut(view, frame.images, frame.anchors, size_px, options.crop_px, fill)
-    disparity_px = cut_nearest(view, frame.disparity_px, size_px, options.crop_px, np.nan) * view.scale
     image = change_light_inside(light_key, view, image, size_px, options)
-    return FrameCrop(
-        image, disparity_px, anchors, camera_of_view(camera, view, options.crop_px), jaxlie.SE3(frame.poses)
-    )
+    density = points_per_pixel(options)
+    fine = View(view.scale * density, view.offset_px * density, view.mirrored)
+    fine_px = options.crop_px[0] * density, options.crop_px[1] * density
+    disparity_px = cut_nearest(fine, frame.disparity_px, size_px, fine_px, np.nan) * fine.scale
+    return FrameCrop(image, disparity_px, anchors, camera_of_view(camera, fine, fine_px), jaxlie.SE3(frame.poses))
+
+
+def points_per_pixel(options: AugmentationOptions) -> int:
+    """Points along each side of a pixel of a crop, so that crops of the middle scale have about all of the frame's."""
+    return max(1, round(1 / float(np.sqrt(options.scale[0] * options.scale[1]))))
 
 
 def camera_of_view(camera: StereoCamera, view: View, crop_px: tuple[int, int]) -> StereoCamera:

@@ -24,10 +24,11 @@ from jaxmap.labellers import make_files_labeller
 from jaxmap.labels import IGNORE
 from jaxmap.mapper import MapperParams, make_mapper
 from jaxmap.models.architecture import Architecture
+from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.deeplab import Weights, training_form
 from jaxmap.training.options import TrainingOptions
 from jaxmap.training.step import StepInfo, TrainState, make_updater, parted
-from jaxmap.tuning.frame_crops import FrameBatch, crop_frame, widest_camera
+from jaxmap.tuning.frame_crops import FrameBatch, crop_frame, points_per_pixel, widest_camera
 from jaxmap.tuning.map_loss import LossOptions, MapTruth, cells_loss, soft_cells
 from jaxmap.tuning.pull_back import frame_evidence
 from jaxmap.tuning.soft_view import soft_columns_of_map
@@ -36,7 +37,8 @@ from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap
 SHOWN = IGNORE - 1
 """The anchor of a pixel that shows some class which the orthomosaic shows, too: its map says which."""
 
-_LEAST_AREA = 1e-6
+_LEAST_AREA = 0.5
+"""Share of a cell that a step's map must have seen."""
 
 
 class Site(NamedTuple):
@@ -120,7 +122,10 @@ def make_map_trainer(architecture: Architecture, options: TrainingOptions, site:
         view_key, dropout_key = jax.random.split(own_key)
         crop = jax.lax.optimization_barrier(crop_frame(view_key, example, site.camera, options.augmentation, fill))
         logits = network(weights, crop.image[None], dropout_key)[0][0]
-        frame = Frame(crop.disparity_px, crop.T_world_camera, class_probabilities=jax.nn.softmax(logits))
+        fine = logits
+        if points_per_pixel(options.augmentation) > 1:
+            fine = resize_bilinear(logits[None], *crop.disparity_px.shape, align_corners=False)[0]
+        frame = Frame(crop.disparity_px, crop.T_world_camera, class_probabilities=jax.nn.softmax(fine))
         return _Labelled(frame, MapperParams(crop.camera, site.params), anchor_loss(logits, crop.anchors, shown))
 
     def map_of(weights: Weights, batch: FrameBatch, key: Array) -> tuple[VoxelMap, Array]:
@@ -175,7 +180,10 @@ def site_loss(voxel_map: VoxelMap, site: Site) -> tuple[Float[Array, ""], Float[
 def _class_loss(voxel_map: VoxelMap, site: Site, target: int) -> tuple[Array, Array]:
     truth, options = site.truths[target], site.losses[target]
     columns = soft_columns_of_map(voxel_map, site.params, site.rule, target, options.softness)
-    said = soft_cells(columns, truth.shares, jax.nn.sigmoid(site.params.class_prior[target]), options)
+    said = soft_cells(columns, truth.shares, jnp.zeros(()), options)
+    # The few crops of a step see many cells in part only. What the map says of the seen part counts, and not what it
+    # would say of the rest, which no label can change.
+    said = said._replace(probability=said.probability / jnp.maximum(said.area, _LEAST_AREA))
     counted = truth.counted & (jax.lax.stop_gradient(said.area) > _LEAST_AREA)
     loss, parts = cells_loss(said, truth._replace(counted=counted), options)
     right = counted & ((said.called > 0.5) == (truth.truly > 0.5))
