@@ -84,6 +84,7 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, te
         truths=truths,
         losses=_losses(config, counts, truths),
         anchor=config.map_truth.anchor,
+        temperature=config.map_truth.temperature,
     )
     trainer = make_map_trainer(start.architecture, config, site, steps=order.steps)
     return TrainingPlan(config, data, start, path, order, trainer)

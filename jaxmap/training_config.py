@@ -48,6 +48,8 @@ class MapTruthConfig:
     anchor: Annotated[float, Ge(0)] = 1.0
     """How firmly the network is held to what it said at first of the classes that no orthomosaic shows, such as the
     background."""
+    temperature: Annotated[float, Gt(0)] = 3.0
+    """Divides the logits before they are fused, while training: above 1, pixels that are surely wrong can learn."""
 
 
 def _mapping() -> MapConfig:

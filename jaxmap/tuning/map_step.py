@@ -53,6 +53,8 @@ class Site(NamedTuple):
         truths: the ground truth of each class that it shows, by the index of the class.
         losses: what the loss of each of these classes is made of; their mean is made small.
         anchor: weight of the anchor loss beside it.
+        temperature: divides the logits before their softmax is fused. Evidence is linear in probabilities, so that of a
+            pixel that is surely wrong has next to no slope, unlike its cross-entropy; softened, it learns.
     """
 
     camera: StereoCamera
@@ -62,7 +64,8 @@ class Site(NamedTuple):
     rule: FusionRule
     truths: Mapping[int, MapTruth]
     losses: Mapping[int, LossOptions]
-    anchor: float
+    anchor: float = 1.0
+    temperature: float = 3.0
 
 
 class Pulled(NamedTuple):
@@ -125,7 +128,9 @@ def make_map_trainer(architecture: Architecture, options: TrainingOptions, site:
         fine = logits
         if points_per_pixel(options.augmentation) > 1:
             fine = resize_bilinear(logits[None], *crop.disparity_px.shape, align_corners=False)[0]
-        frame = Frame(crop.disparity_px, crop.T_world_camera, class_probabilities=jax.nn.softmax(fine))
+        frame = Frame(
+            crop.disparity_px, crop.T_world_camera, class_probabilities=jax.nn.softmax(fine / site.temperature)
+        )
         return _Labelled(frame, MapperParams(crop.camera, site.params), anchor_loss(logits, crop.anchors, shown))
 
     def map_of(weights: Weights, batch: FrameBatch, key: Array) -> tuple[VoxelMap, Array]:
