@@ -25,6 +25,7 @@ from .sequence import prepare_frames, run_sequence
 from .stereo.front_end import StereoFrontEnd
 from .stereo.options import StereoOptions
 from .stereo.rectify import make_stereo_rig
+from .tuning.pull_back import make_pull_back, map_gradient
 from .types import (
     Frame,
     GridSpec,
@@ -89,9 +90,11 @@ __all__ = [
     "make_network",
     "make_no_labeller",
     "make_plane_labeller",
+    "make_pull_back",
     "make_stereo_camera",
     "make_stereo_rig",
     "make_voxel_map",
+    "map_gradient",
     "occupancy_probability",
     "open_sequence",
     "plane_distance",

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Interval
+from annotated_types import Ge, Gt, Interval
 from pydantic import BeforeValidator
 
+from jaxmap.config import GridConfig, MapConfig
 from jaxmap.settings import Settings
 from jaxmap.training.options import NetworkOptions, TrainingOptions
 
@@ -32,13 +34,43 @@ class DataConfig:
 
 
 @dataclass(frozen=True)
+class MapTruthConfig:
+    """How maps are compared with the ground truth, with map supervision."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+
+    cell_size_m: Annotated[float, Gt(0)] = 0.2
+    """Edge of the cells that map and ground truth are compared in."""
+    remap: tuple[str, ...] | None = None
+    """What the values of the orthomosaic mean, as in evaluate: such as 0=unlabelled 1=sand 2=rock."""
+    crs: str | None = None
+    """Coordinate reference system of the orthomosaic, in place of its own."""
+    anchor: Annotated[float, Ge(0)] = 1.0
+    """How firmly the network is held to what it said at first of the classes that no orthomosaic shows, such as the
+    background."""
+    temperature: Annotated[float, Gt(0)] = 3.0
+    """Divides the logits before they are fused, while training: above 1, pixels that are surely wrong can learn."""
+
+
+def _mapping() -> MapConfig:
+    return MapConfig(grid=GridConfig(voxel_size_m=(0.1, 0.1, 0.2)))
+
+
+@dataclass(frozen=True)
 class TrainConfig(TrainingOptions):
     """Everything that decides what a training run comes out as."""
 
+    supervision: Literal["pixels", "map"] = "pixels"
+    """What teaches: masks of images, or an orthomosaic that the map of a sequence is compared with."""
+    ground_truth: Path | None = None
+    """The labelled orthomosaic, with map supervision."""
     classes: tuple[str, ...] = ("background", "sand", "rock")
     """The classes, in the order of the labels."""
     data: DataConfig = field(default_factory=DataConfig)
     network: NetworkOptions = field(default_factory=NetworkOptions)
+    map_truth: MapTruthConfig = field(default_factory=MapTruthConfig)
+    mapping: MapConfig = field(default_factory=_mapping)
+    """How the sequence is read and mapped, with map supervision: as the settings of jaxmap map."""
 
 
 _SETTINGS = Settings(TrainConfig, "train", folder="train", given=("training_data", "init"))

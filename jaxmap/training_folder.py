@@ -43,7 +43,7 @@ class TrainingFolder:
             UsageError: the run to be resumed had other settings.
         """
         tree = {
-            "training_data": str(plan.training_set.folder.resolve()),
+            "training_data": plan.data.source,
             "init": None if plan.init is None else str(plan.init.resolve()),
             **train_config_tree(plan.config),
         }
@@ -88,8 +88,8 @@ class TrainingFolder:
     def write_report(self, plan: TrainingPlan, log: TrainingLog, shown: Sequence[Shown], status: str) -> None:
         """Writes report.html and metrics.json; `status` says why the run has stopped, if it has."""
         record = TrainingRecord(
-            title=plan.training_set.folder.resolve().name,
-            classes=plan.training_set.classes,
+            title=plan.data.title,
+            classes=plan.start.architecture.classes,
             history=log.history,
             summary={name: scores for name, scores in (("best", log.best), ("last", log.last)) if scores},
             facts=_facts(plan),
@@ -102,12 +102,12 @@ class TrainingFolder:
 
 
 def _facts(plan: TrainingPlan) -> dict[str, str]:
-    config, record, data = plan.config, plan.start.architecture, plan.training_set
-    fixed = f"{plan.order.examples} fixed examples" if plan.order.variants > 1 else "drawn anew each time"
+    config, record = plan.config, plan.start.architecture
+    fixed = f"{plan.order.examples} fixed ones" if plan.order.variants > 1 else "drawn anew each time"
     size, scale, optimiser = config.augmentation.crop_px, config.augmentation.scale, config.optimiser
     return {
-        "Training images": f"{len(data.train)}, {fixed}",
-        "Validation images": str(len(data.validation)),
+        **plan.data.facts(),
+        "Examples": fixed,
         "Network": f"DeepLabv3{'+' * record.decoder}, {record.backbone}, output stride {record.output_stride}",
         "Started from": "random weights" if plan.init is None else plan.init.name,
         "Fresh weights": ", ".join(plan.start.fresh) or "none",
@@ -120,18 +120,14 @@ def _facts(plan: TrainingPlan) -> dict[str, str]:
 
 def metrics_of(plan: TrainingPlan, log: TrainingLog) -> dict[str, Any]:
     """What metrics.json holds."""
-    steps, data = log.history[-1]["step"] if log.history else 0, plan.training_set
+    steps = log.history[-1]["step"] if log.history else 0
     return {
         "epochs": len(log.history),
         "steps": steps,
         "complete": log.complete,
         "seconds": round(log.seconds, 1),
-        "images": {"train": len(data.train), "validation": len(data.validation)},
         "examples_seen": steps * plan.config.batch_size,
-        "class_pixels": {
-            name: {"train": int(train), "validation": int(validation)}
-            for name, train, validation in zip(data.classes, *plan.class_pixels, strict=True)
-        },
+        **plan.data.counts(),
         "fresh": list(plan.start.fresh),
         "kept_epoch": log.kept(plan.config.keep).get("epoch"),
         "best": log.best,

@@ -57,7 +57,7 @@ class Meter:
         self._infos.append(info)
         self._images += images
         rate = self._images / max(self.seconds, 1e-9)
-        return f"loss {float(info.loss):.3f}, pixel accuracy {float(info.accuracy):.1%}, {rate:.1f} images/s"
+        return f"loss {float(info.loss):.3f}, accuracy {float(info.accuracy):.1%}, {rate:.1f} images/s"
 
     @property
     def seconds(self) -> float:

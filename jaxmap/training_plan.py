@@ -2,22 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxmap.errors import UsageError
+from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import load_model
-from jaxmap.training.batches import Order, Pixels
+from jaxmap.models.deeplab import Weights
+from jaxmap.training.batches import Order, Pixels, batches_from
 from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set
 from jaxmap.training.losses import class_weights
 from jaxmap.training.starts import Start, make_start
-from jaxmap.training.step import Trainer, make_trainer
+from jaxmap.training.step import Batch, Trainer, make_trainer
+from jaxmap.training.validation import Validation, Validator
 from jaxmap.training_config import TrainConfig
+from jaxmap.tuning.map_step import MapTrainer
+
+
+class Validates(Protocol):
+    """Says how good weights are."""
+
+    def score(self, weights: Weights) -> Validation:
+        """Scores weights, running statistics included."""
+        ...
+
+
+class TrainingData(Protocol):
+    """What a run learns from and is validated on: images with masks, or the frames of a map."""
+
+    @property
+    def source(self) -> str:
+        """The folder or sequence, for config.yaml."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """A heading."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of the examples that are learnt from."""
+        ...
+
+    def batches(self, order: Order, first_step: int) -> Iterator[Any]:
+        """The batches of a run from a step on."""
+        ...
+
+    def validator(self, architecture: Architecture) -> Validates | None:
+        """What validates; None where nothing does."""
+        ...
+
+    def digest(self) -> str:
+        """A fingerprint of what a resumed run must share beside its settings."""
+        ...
+
+    def counts(self) -> dict[str, Any]:
+        """What metrics.json tells of the data."""
+        ...
+
+    def facts(self) -> dict[str, str]:
+        """What the page tells of the data."""
+        ...
 
 
 class TrainingPlan(NamedTuple):
@@ -25,27 +77,80 @@ class TrainingPlan(NamedTuple):
 
     Attributes:
         config: its settings.
-        training_set: its images.
-        class_pixels: pixels of each class, in training (row 0) and validation (row 1).
+        data: what it learns from.
         start: the network and its first weights.
         init: the file that training starts from, or None.
         order: which example is seen when.
-        pixels: reads them.
         trainer: the compiled step.
     """
 
     config: TrainConfig
-    training_set: TrainingSet
-    class_pixels: np.ndarray
+    data: TrainingData
     start: Start
     init: Path | None
     order: Order
+    trainer: Trainer | MapTrainer
+
+
+@dataclass(frozen=True)
+class ImageData:
+    """Images with masks, as `TrainingData`.
+
+    Attributes:
+        training_set: the images.
+        class_pixels: pixels of each class, in training (row 0) and validation (row 1).
+        pixels: reads them.
+    """
+
+    training_set: TrainingSet
+    class_pixels: np.ndarray
     pixels: Pixels
-    trainer: Trainer
+
+    @property
+    def source(self) -> str:
+        """The folder."""
+        return str(self.training_set.folder.resolve())
+
+    @property
+    def title(self) -> str:
+        """The folder's name."""
+        return self.training_set.folder.resolve().name
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the training images."""
+        return tuple(example.name for example in self.training_set.train)
+
+    def batches(self, order: Order, first_step: int) -> Iterator[Batch]:
+        """The batches of a run from a step on."""
+        return batches_from(self.pixels, order, first_step)
+
+    def validator(self, architecture: Architecture) -> Validator | None:
+        """Scores the pixels of the validation images; None where there are none."""
+        validation = self.training_set.validation
+        return Validator(architecture, validation, self.training_set.lookup) if validation else None
 
     def digest(self) -> str:
-        """A fingerprint of what a resumed run must share beside its settings."""
+        """A fingerprint of images, masks and split."""
         return digest(self.training_set)
+
+    def counts(self) -> dict[str, Any]:
+        """Images, and pixels of each class."""
+        data = self.training_set
+        return {
+            "images": {"train": len(data.train), "validation": len(data.validation)},
+            "class_pixels": {
+                name: {"train": int(train), "validation": int(validation)}
+                for name, train, validation in zip(data.classes, *self.class_pixels, strict=True)
+            },
+        }
+
+    def facts(self) -> dict[str, str]:
+        """Numbers of images."""
+        return {
+            "Training images": str(len(self.training_set.train)),
+            "Validation images": str(len(self.training_set.validation)),
+        }
 
 
 def plan_training(
@@ -68,9 +173,7 @@ def plan_training(
     Raises:
         JaxmapError: data, settings and file do not serve.
     """
-    low, high = config.augmentation.scale
-    if low > high:
-        raise UsageError(f"augmentation.scale is {low} {high}", fix="give the least factor first")
+    check_scale(config)
     losses = config.loss
     if not (losses.cross_entropy or losses.soft_iou or losses.lovasz):
         raise UsageError("every loss has a weight of 0", where="--loss", fix="give one of them a weight")
@@ -100,19 +203,34 @@ def plan_training(
     saved = None if init is None else load_model(init)
     start = make_start(config.network, config.norm, config.classes, saved, seed=config.seed, where=init or "network")
     order = Order.of(len(training_set.train), config)
-    record, numbers = start.architecture, sum(jnp.size(weight) for weight in start.weights.values())
-    tell(
-        f"DeepLabv3{'+' * record.decoder} on {record.backbone}, {numbers / 1e6:.1f} million numbers, "
-        f"output stride {record.output_stride}; fresh: {', '.join(start.fresh) or 'nothing'}; "
-        f"batch norm learns in: {', '.join(start.batch_norms) or 'nothing'}"
-    )
+    tell(told_start(start))
     trainer = make_trainer(
-        record,
+        start.architecture,
         config,
         steps=order.steps,
         class_weights=jnp.asarray(class_weights(config.loss, counts[0])),
         batch_norms=start.batch_norms,
     )
-    return TrainingPlan(
-        config, training_set, counts, start, init, order, Pixels(training_set.train, training_set.lookup), trainer
+    data = ImageData(training_set, counts, Pixels(training_set.train, training_set.lookup))
+    return TrainingPlan(config, data, start, init, order, trainer)
+
+
+def check_scale(config: TrainConfig) -> None:
+    """Refuses crops of no scale.
+
+    Raises:
+        UsageError: the least factor is above the greatest.
+    """
+    low, high = config.augmentation.scale
+    if low > high:
+        raise UsageError(f"augmentation.scale is {low} {high}", fix="give the least factor first")
+
+
+def told_start(start: Start) -> str:
+    """One line on the network and its first weights."""
+    record, numbers = start.architecture, sum(jnp.size(weight) for weight in start.weights.values())
+    return (
+        f"DeepLabv3{'+' * record.decoder} on {record.backbone}, {numbers / 1e6:.1f} million numbers, "
+        f"output stride {record.output_stride}; fresh: {', '.join(start.fresh) or 'nothing'}; "
+        f"batch norm learns in: {', '.join(start.batch_norms) or 'nothing'}"
     )

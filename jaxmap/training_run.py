@@ -14,10 +14,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxmap.errors import JaxmapError
 from jaxmap.models.checkpoint import save_model
 from jaxmap.models.deeplab import Weights
-from jaxmap.training.batches import batches_from
 from jaxmap.training.checkpoints import Checkpoints
 from jaxmap.training.step import StepInfo, TrainState
-from jaxmap.training.validation import Shown, Validation, Validator
+from jaxmap.training.validation import Shown, Validation
 from jaxmap.training_folder import TrainingFolder, metrics_of
 from jaxmap.training_log import Meter, TrainingLog
 from jaxmap.training_plan import TrainingPlan
@@ -46,11 +45,8 @@ class TrainingRun:
     ) -> None:
         self._plan, self._folder, self._tell, self._on_step = plan, folder, tell, on_step
         self._checkpoints = Checkpoints(folder.checkpoints)
-        validation = plan.training_set.validation
-        self._validator = (
-            Validator(plan.start.architecture, validation, plan.training_set.lookup) if validation else None
-        )
-        self._log = TrainingLog(digest=plan.digest())
+        self._validator = plan.data.validator(plan.start.architecture)
+        self._log = TrainingLog(digest=plan.data.digest())
         self._shown: tuple[Shown, ...] = ()
         self._reported_s = 0.0
         self._status = ""
@@ -73,7 +69,7 @@ class TrainingRun:
         epoch = len(self._log.history)
         meter, first_step = Meter(), int(state.step)
         try:
-            for step, batch in enumerate(batches_from(plan.pixels, plan.order, first_step), first_step):
+            for step, batch in enumerate(plan.data.batches(plan.order, first_step), first_step):
                 state, info = plan.trainer.step(state, jax.device_put(batch, share.split), key)
                 self._check_finite(info, step, epoch)
                 self._on_step(step + 1, meter.add(info, plan.config.batch_size))
@@ -116,7 +112,7 @@ class TrainingRun:
         if log.digest != self._log.digest:
             raise JaxmapError(
                 "the training data have changed since the run was begun",
-                where=self._plan.training_set.folder,
+                where=self._plan.data.source,
                 fix="restore them, or start anew with --overwrite",
             )
         self._log = log
@@ -127,7 +123,7 @@ class TrainingRun:
         if bool(info.finite):
             return
         order = self._plan.order
-        images = [self._plan.training_set.train[place // order.variants].name for place in order.draws(step)[:, 1]]
+        images = [self._plan.data.names[int(place) // order.variants] for place in order.draws(step)[:, 1]]
         loss, norm = float(info.loss), float(info.gradient_norm)
         numbers = f"loss {loss:g}, gradient norm {norm:g}"
         raise JaxmapError(

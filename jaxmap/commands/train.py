@@ -19,15 +19,17 @@ OUTPUTS = ("report.html", "model.safetensors", "history.csv", "metrics.json", "c
 
 @dataclass(frozen=True)
 class TrainArguments:
-    """Train or fine-tune DeepLabv3+ on images and masks.
+    """Train or fine-tune DeepLabv3+ on images and masks, or on a stereo sequence and an orthomosaic.
 
     The folder holds images/NAME.{png,jpg,...} and masks/NAME.png, and may hold train.txt and val.txt of names.
+    With --supervision map it is a sequence, as of jaxmap map, or sample:NAME, and no image is labelled: the network,
+    the bundled one if --init names no other, learns to make the map that --ground-truth shows from above.
     Writes into the run folder: model.safetensors, history.csv, metrics.json, config.yaml, report.html and
     checkpoints/, from which an interrupted run goes on exactly (--resume).
     """
 
     data_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")]
-    """Folder of the training data."""
+    """Folder of the training data: images and masks, or with --supervision map a sequence."""
     out: Path
     """The run folder to write."""
     init: Path | None = None
@@ -49,6 +51,7 @@ def main(words: Sequence[str]) -> int:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
 
     from jaxmap.cache import keep_compiled_programs
+    from jaxmap.map_training_plan import plan_map_training
     from jaxmap.output_folder import locked
     from jaxmap.training_folder import TrainingFolder
     from jaxmap.training_plan import plan_training
@@ -57,7 +60,12 @@ def main(words: Sequence[str]) -> int:
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
-    plan = plan_training(arguments.data_folder, config, arguments.init, tell=console.tell)
+    if config.supervision == "map":
+        plan = plan_map_training(str(arguments.data_folder), config, arguments.init, tell=console.tell)
+    elif config.ground_truth is not None:
+        raise UsageError("--ground-truth is given, but pixels supervise", fix="add --supervision map, or leave it out")
+    else:
+        plan = plan_training(arguments.data_folder, config, arguments.init, tell=console.tell)
     folder = TrainingFolder(arguments.out)
     with locked(arguments.out):
         folder.begin(plan, resume=arguments.resume, overwrite=arguments.overwrite)

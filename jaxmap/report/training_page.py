@@ -83,7 +83,10 @@ def _stats(record: TrainingRecord) -> list[tuple[str, str]]:
     best, rows, epoch = _best(record), record.history, _best_epoch(record)
     stats: list[tuple[str, str | None]] = []
     if best:
-        stats += [("mean IoU", score_text(best.get("mean_iou"))), ("pixel accuracy", score_text(best.get("accuracy")))]
+        stats += [
+            ("mean IoU", score_text(best.get("mean_iou"))),
+            (f"{best.get('unit', 'pixel')} accuracy", score_text(best.get("accuracy"))),
+        ]
         stats += [("calibration error", score_text(best.get("ece")))]
     losses, rates, times = (_values(rows, key) for key in ("train_loss", "images_per_s", "seconds"))
     count = value_text(len(rows))
@@ -156,7 +159,7 @@ def _scores(record: TrainingRecord) -> str:
     last = record.summary.get("last")
     other = last if last and last.get("epoch") != best.get("epoch") else None
     images, pixels = value_text(best.get("images")), value_text(best.get("pixels"))
-    told = f"Validation: {images} images, {pixels} labelled pixels"
+    told = f"Validation: {images} images, {pixels} labelled {best.get('unit', 'pixel')}s"
     epoch = _best_epoch(record)
     when = f", after epoch {number_text(epoch)}" if epoch is not None else ""
     tables = (

@@ -28,7 +28,15 @@ def score_text(value: object) -> str:
 def class_table(best: Scores, last: Scores | None, classes: Sequence[str]) -> str:
     """IoU, precision and recall of each class; the IoU of the last epoch beside them where it is another."""
     colours = class_colours(classes)[: len(classes)].tolist()
-    heads = ["Class", "IoU", *(["IoU, last"] if last else []), "precision", "recall", "true pixels", ""]
+    heads = [
+        "Class",
+        "IoU",
+        *(["IoU, last"] if last else []),
+        "precision",
+        "recall",
+        f"true {best.get('unit', 'pixel')}s",
+        "",
+    ]
     body = ""
     for name, colour in zip(classes, colours, strict=True):
         scores = _of_class(best, name)

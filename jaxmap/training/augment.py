@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped, UInt8
 
 from jaxmap.labels import IGNORE
 from jaxmap.training.options import AugmentationOptions
@@ -114,11 +114,20 @@ def cut(
     """
     rows, columns = (_positions(view, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
     inside = rows.inside[:, None] & columns.inside[None, :]
-    near = labels[rows.nearest][:, columns.nearest]
     values = image.astype(jnp.float32)
     values = _between(values[rows.low], values[rows.high], rows.share[:, None, None])
     values = _between(values[:, columns.low], values[:, columns.high], columns.share[None, :, None])
-    return jnp.where(inside[..., None], values, jnp.array(fill)), jnp.where(inside, near, IGNORE).astype(jnp.uint8)
+    near = cut_nearest(view, labels, size_px, crop_px, IGNORE)
+    return jnp.where(inside[..., None], values, jnp.array(fill)), near
+
+
+def cut_nearest(
+    view: View, values: Shaped[Array, "H W"], size_px: Int[Array, "2"], crop_px: tuple[int, int], outside: float
+) -> Shaped[Array, "h w"]:
+    """Cuts a view out of numbers that cannot be interpolated; `outside` is what lies outside the image."""
+    rows, columns = (_positions(view, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
+    inside = rows.inside[:, None] & columns.inside[None, :]
+    return jnp.where(inside, values[rows.nearest][:, columns.nearest], outside).astype(values.dtype)
 
 
 class _Positions(NamedTuple):
@@ -209,11 +218,14 @@ def augment(
         lambda whole, part: jnp.where(original, whole, part), whole_view(size_px, options.crop_px), drawn
     )
     crop, near = cut(view, image, labels, size_px, options.crop_px, fill)
-    # Outside the image the colour stays the fill, whatever the light.
-    lit = jnp.where(_outside(view, size_px, options.crop_px)[..., None], crop, change_light(light_key, crop, options))
+    lit = change_light_inside(light_key, view, crop, size_px, options)
     return jnp.where(original, crop, lit), near
 
 
-def _outside(view: View, size_px: Array, crop_px: tuple[int, int]) -> Array:
-    rows, columns = (_positions(view, axis, size_px[axis], crop_px[axis]).inside for axis in (0, 1))
-    return ~(rows[:, None] & columns[None, :])
+def change_light_inside(
+    key: PRNGKeyArray, view: View, crop: Float[Array, "h w 3"], size_px: Int[Array, "2"], options: AugmentationOptions
+) -> Float[Array, "h w 3"]:
+    """`change_light`, but the colour outside the image stays the fill."""
+    rows, columns = (_positions(view, axis, size_px[axis], options.crop_px[axis]).inside for axis in (0, 1))
+    outside = ~(rows[:, None] & columns[None, :])
+    return jnp.where(outside[..., None], crop, change_light(key, crop, options))

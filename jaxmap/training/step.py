@@ -100,17 +100,8 @@ def make_trainer(
             learn from it; the others keep theirs.
     """
     network = training_form(architecture, batch_norms)
-    optimiser = make_optimiser(options.optimiser, steps)
-    rate = poly_rate(options.optimiser, steps)
+    updater = make_updater(options, steps)
     fill = tuple(255 * value for value in architecture.mean)
-    decay = options.optimiser.average
-
-    def init(weights: Weights) -> TrainState:
-        # Copies: the state is donated, and the caller's weights are not.
-        weights = jax.tree.map(jnp.array, weights)
-        moved, _ = _parted(weights, options)
-        average = jax.tree.map(jnp.array, weights) if decay else {}
-        return TrainState(weights, average, optimiser.init(moved), jnp.zeros((), jnp.int32))
 
     def loss(weights: Weights, images: Array, labels: Array, key: Array) -> tuple[Array, tuple[Array, Weights]]:
         logits, statistics = network(weights, images, key)
@@ -127,13 +118,51 @@ def make_trainer(
         view_key, dropout_key = jax.random.split(key)
         with jax.named_scope("augment"):
             images, labels = jax.lax.optimization_barrier(examples(batch, view_key))
-        moved, fixed = _parted(state.weights, options)
+        moved, fixed = parted(state.weights, options)
 
         def of_moved(moved: Weights) -> tuple[Array, tuple[Array, Weights]]:
             return loss({**fixed, **moved}, images, labels, jax.random.fold_in(dropout_key, state.step))
 
         (value, (logits, statistics)), gradient = jax.value_and_grad(of_moved, has_aux=True)(moved)
+        known = labels != IGNORE
+        right = known & (logits.argmax(axis=-1) == labels)
+        accuracy = right.sum() / jnp.maximum(known.sum(), 1)
+        return updater.update(state, value, accuracy, gradient, statistics)
+
+    return Trainer(updater.init, jax.jit(step, donate_argnums=0), loss)
+
+
+class Updater(NamedTuple):
+    """How gradients become new weights, whatever the loss was of.
+
+    Attributes:
+        init: `(weights) -> TrainState`.
+        update: `(state, loss, accuracy, gradient, statistics) -> (state, StepInfo)`, with the gradient of the weights
+            that move (`parted`) and the running statistics that the step has changed.
+    """
+
+    init: Callable[[Weights], TrainState]
+    update: Callable[[TrainState, Array, Array, Weights, Weights], tuple[TrainState, StepInfo]]
+
+
+def make_updater(options: TrainingOptions, steps: int) -> Updater:
+    """Builds the optimiser of a run of so many steps, and what goes with it."""
+    optimiser = make_optimiser(options.optimiser, steps)
+    rate = poly_rate(options.optimiser, steps)
+    decay = options.optimiser.average
+
+    def init(weights: Weights) -> TrainState:
+        # Copies: the state is donated, and the caller's weights are not.
+        weights = jax.tree.map(jnp.array, weights)
+        moved, _ = parted(weights, options)
+        average = jax.tree.map(jnp.array, weights) if decay else {}
+        return TrainState(weights, average, optimiser.init(moved), jnp.zeros((), jnp.int32))
+
+    def update(
+        state: TrainState, value: Array, accuracy: Array, gradient: Weights, statistics: Weights
+    ) -> tuple[TrainState, StepInfo]:
         with jax.named_scope("optimiser"):
+            moved, fixed = parted(state.weights, options)
             updates, optimiser_state = optimiser.update(gradient, state.optimiser, moved)
             moved = cast(Weights, optax.apply_updates(moved, updates))
             weights = {**fixed, **moved, **statistics}
@@ -146,15 +175,12 @@ def make_trainer(
                 finite &= jnp.isfinite(weight).all()
             new = TrainState(weights, average, optimiser_state, state.step + 1)
             new = jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state)
-        known = labels != IGNORE
-        right = known & (logits.argmax(axis=-1) == labels)
-        accuracy = right.sum() / jnp.maximum(known.sum(), 1)
         return new, StepInfo(value, accuracy, norm, jnp.asarray(rate(state.step)), finite)
 
-    return Trainer(init, jax.jit(step, donate_argnums=0), loss)
+    return Updater(init, update)
 
 
-def _parted(weights: Weights, options: TrainingOptions) -> tuple[Weights, Weights]:
+def parted(weights: Weights, options: TrainingOptions) -> tuple[Weights, Weights]:
     """The weights that the optimiser moves, and the others."""
     names = trained_names(weights, options.optimiser)
     moved = {name: weight for name, weight in weights.items() if name in names}

@@ -21,10 +21,17 @@ from jaxmap.training.options import (
     OptimiserOptions,
     TrainingOptions,
 )
-from jaxmap.training_config import DataConfig, TrainConfig, check_train_config, load_train_config, train_config_tree
+from jaxmap.training_config import (
+    DataConfig,
+    MapTruthConfig,
+    TrainConfig,
+    check_train_config,
+    load_train_config,
+    train_config_tree,
+)
 
 CONFIGS = sorted((config_folder() / "train").glob("*.yaml"))
-SECTIONS = ("augmentation", "loss", "optimiser", "norm", "data", "network")
+SECTIONS = ("augmentation", "loss", "optimiser", "norm", "data", "network", "map_truth")
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -103,7 +110,7 @@ def test_the_settings_of_a_run_can_be_read_again(tmp_path):
 @pytest.mark.parametrize(
     "kind",
     [TrainConfig, TrainingOptions, AugmentationOptions, LossOptions, OptimiserOptions, NormOptions, DataConfig,
-     NetworkOptions],
+     NetworkOptions, MapTruthConfig],
 )  # fmt: skip
 def test_every_setting_has_a_default_and_says_what_it_is(kind):
     assert is_dataclass(kind) and kind() == kind()

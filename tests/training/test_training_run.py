@@ -412,7 +412,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_its_images(plan, whol
     run = tmp_path / "run"
     with pytest.raises(JaxmapError) as caught:
         go(plan._replace(trainer=plan.trainer._replace(step=spoilt)), run)
-    images = {plan.training_set.train[index].name for index in plan.order.draws(6)[:, 1]}
+    images = {plan.data.names[index] for index in plan.order.draws(6)[:, 1]}
     assert "loss nan" in caught.value.what and "step 7, epoch 3" in caught.value.what
     assert all(name in caught.value.what for name in images)
     assert "optimiser.learning-rate" in caught.value.fix

@@ -1,0 +1,254 @@
+"""A training run by map supervision, decided in full before the first step: `jaxmap train --supervision map`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxmap.config import MapConfig
+from jaxmap.datasets.crs import Extent, read_crs
+from jaxmap.datasets.label_coding import DEFAULT_CODING, LabelCoding, parse_coding
+from jaxmap.datasets.orthomosaic import read_label_orthomosaic
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.files import bundled
+from jaxmap.geometry.camera import disparity_to_points, transform_points
+from jaxmap.geometry.grid import exact_corner
+from jaxmap.labels import IGNORE
+from jaxmap.map_training_data import CellTruth, KeptFrame, MapData, class_pixels
+from jaxmap.mapping_plan import Plan, Tell, plan_run
+from jaxmap.models.checkpoint import SavedModel, load_network
+from jaxmap.segmentation import Segmenter
+from jaxmap.sequence import prepare_frames
+from jaxmap.training.batches import Order
+from jaxmap.training.losses import class_weights
+from jaxmap.training.starts import make_start
+from jaxmap.training_config import TrainConfig
+from jaxmap.training_plan import TrainingPlan, check_scale, told_start
+from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth
+from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
+from jaxmap.types import Frame
+
+MAX_FRAME_BYTES = 4 * 2**30
+"""All frames are held in memory."""
+
+_OF_THE_NETWORK = ("labeller", "model", "model_sha256", "labels", "labels_are", "classes")
+"""Settings of a mapping that say what labels; here that is the network which is trained."""
+
+
+def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, tell: Tell) -> TrainingPlan:
+    """Reads the sequence and the orthomosaic, prepares all frames once, and builds network and step.
+
+    Args:
+        source: the folder of one sequence, or `sample:NAME`.
+        config: the settings.
+        init: the network to start from; the bundled one by default.
+        tell: takes lines for the user.
+
+    Raises:
+        JaxmapError: sequence, orthomosaic, settings and network do not serve.
+    """
+    _check(config)
+    assert config.ground_truth is not None
+    path = init or bundled("rover.safetensors")
+    saved = load_network(path)
+    start = make_start(config.network, config.norm, config.classes, saved, seed=config.seed, where=path)
+    if start.fresh or start.batch_norms:
+        what = f"{', '.join(start.fresh)} would be random" if start.fresh else "batch norm would learn"
+        raise UsageError(
+            f"map supervision teaches a network that knows the classes already: {what}",
+            where=path,
+            fix="train it on images first, and leave --classes, network and norm as they are there",
+        )
+    mapping = replace(config.mapping, labeller="deeplab", model=path, classes=config.classes)
+    plan = plan_run(source, mapping, tell)
+    truth, truths = read_cells(plan, config)
+    frames = keep_frames(plan, truth, saved, config.map_truth.anchor, tell)
+    train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
+    data = MapData(plan, truth, train, validation, config.ground_truth.name)
+    counts = class_pixels(train, len(config.classes))
+    _check_shown(counts, data, config)
+    tell(_told(data, counts))
+    tell(told_start(start))
+    order = Order.of(len(train), config)
+    site = Site(
+        camera=plan.front_end.camera,
+        grid=plan.grid,
+        depth_range_m=plan.depth_range_m,
+        params=plan.params.fusion,
+        rule=plan.rule,
+        truths=truths,
+        losses=_losses(config, counts, truths),
+        anchor=config.map_truth.anchor,
+        temperature=config.map_truth.temperature,
+    )
+    trainer = make_map_trainer(start.architecture, config, site, steps=order.steps)
+    return TrainingPlan(config, data, start, path, order, trainer)
+
+
+def _check(config: TrainConfig) -> None:
+    """Refuses settings that mean nothing here."""
+    if config.ground_truth is None:
+        raise UsageError("map supervision needs an orthomosaic", fix="give --ground-truth F.tif")
+    check_scale(config)
+    losses = config.loss
+    if losses.lovasz or losses.label_smoothing:
+        raise UsageError(
+            "loss.lovasz and loss.label_smoothing are of pixels", where="--supervision map", fix="leave them out"
+        )
+    if not (losses.cross_entropy or losses.soft_iou):
+        raise UsageError("every loss has a weight of 0", where="--loss", fix="give one of them a weight")
+    if config.augmentation.copies is not None:
+        raise UsageError("augmentation.copies is for images", where="--supervision map", fix="leave it out")
+    if jax.local_device_count() > 1:
+        raise UsageError("map supervision runs on one device", fix="hide the others (CUDA_VISIBLE_DEVICES=0)")
+    plain = MapConfig()
+    if named := [name for name in _OF_THE_NETWORK if getattr(config.mapping, name) != getattr(plain, name)]:
+        raise UsageError(
+            f"mapping.{named[0]} says nothing here: the network that is trained labels",
+            where="--supervision map",
+            fix="name the network with --init and its classes with --classes",
+        )
+
+
+def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, MapTruth]]:
+    """The orthomosaic over the map: as rasters and cells, and as arrays of the loss, for each class it shows.
+
+    Raises:
+        JaxmapError: it cannot be read, or does not lie over the map.
+        UsageError: it shows fewer than two classes of the network.
+    """
+    options, path = config.map_truth, config.ground_truth
+    assert path is not None
+    coding: LabelCoding = DEFAULT_CODING if options.remap is None else parse_coding(options.remap, "map_truth.remap")
+    named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
+    shown = [index for index, name in enumerate(config.classes) if name in named]
+    if len(shown) < 2:
+        raise UsageError(
+            f"the ground truth shows fewer than two classes of the network ({' '.join(config.classes)}): "
+            f"{coding.text()}",
+            where=path,
+            fix="say what its values mean: --map-truth.remap 0=unlabelled 1=sand 2=rock",
+        )
+    if options.crs is not None:
+        read_crs(options.crs, "map_truth.crs")
+    place, rasters, truths, labels, cells = _place(plan), {}, {}, None, None
+    for index in shown:
+        raster = read_label_orthomosaic(path, place, coding=coding, target=config.classes[index], crs=options.crs)
+        rasters[index] = raster
+        truths[index], found, cells = make_map_truth(
+            plan.grid, raster, plan.sequence.site_origin, plan.sequence.crs, cell_size_m=options.cell_size_m
+        )
+        labels = np.full(found.labelled.shape, IGNORE, np.uint8) if labels is None else labels
+        labels[found.truly()] = index
+    assert labels is not None and cells is not None
+    return CellTruth(rasters, cells, labels), truths
+
+
+def _place(plan: Plan) -> Extent:
+    """The extent of the map in its coordinate reference system."""
+    origin_m, voxel_m = exact_corner(plan.grid)
+    low = plan.sequence.site_origin[:2] + origin_m[:2]
+    high = low + voxel_m[:2] * plan.grid.shape[:2]
+    return Extent(float(low[0]), float(low[1]), float(high[0]), float(high[1]), plan.sequence.crs)
+
+
+def keep_frames(plan: Plan, truth: CellTruth, first: SavedModel, anchor: float, tell: Tell) -> tuple[KeptFrame, ...]:
+    """All frames that can be used, prepared; the others are told.
+
+    Raises:
+        JaxmapError: they take too much memory.
+    """
+    camera = plan.front_end.camera
+    needed = len(plan.sequence.frames) * camera.width_px * camera.height_px * (3 + 4 + 1 + 1)
+    if needed > MAX_FRAME_BYTES:
+        raise JaxmapError(
+            f"{len(plan.sequence.frames)} frames would take {needed / 2**30:.1f} GiB of memory",
+            where=plan.sequence.name,
+            fix="take fewer: --mapping.stride, --mapping.stop",
+        )
+    hidden = [index for index in range(len(plan.labeller.classes)) if index not in truth.rasters]
+    teacher = Segmenter(first) if hidden and anchor > 0 else None
+    kept = []
+    for prepared in prepare_frames(plan.sequence, plan.front_end, needs="image"):
+        if prepared.frame is None or prepared.rectified is None:
+            tell(f"skipped: {prepared.fault}")
+            continue
+        anchors = np.full(prepared.frame.disparity_px.shape, IGNORE, np.uint8)
+        if teacher is not None:
+            said = teacher.logits(prepared.rectified.left).argmax(axis=-1)
+            anchors = np.where(np.isin(said, hidden), said, SHOWN).astype(np.uint8)
+        cells = cells_of_pixels(prepared.frame, plan, truth)
+        kept.append(KeptFrame(prepared.ref.name, prepared.frame, anchors, cells))
+    return tuple(kept)
+
+
+def cells_of_pixels(frame: Frame, plan: Plan, truth: CellTruth) -> UInt8[np.ndarray, "H W"]:
+    """The class of the cell that each pixel's point lies in; `IGNORE` where there is none."""
+    points_camera, valid = disparity_to_points(plan.front_end.camera, frame.disparity_px)
+    points_world = np.asarray(transform_points(frame.T_world_camera, points_camera))
+    depth_m, (least_m, most_m) = np.asarray(points_camera[..., 2]), plan.depth_range_m
+    used = np.asarray(valid) & (depth_m >= least_m) & (depth_m <= most_m)
+    return np.where(used, truth.of_points(points_world), np.uint8(IGNORE))
+
+
+def _split(
+    frames: tuple[KeptFrame, ...], share: float, name: str
+) -> tuple[tuple[KeptFrame, ...], tuple[KeptFrame, ...]]:
+    """The frames that teach and those that validate: the last ones, because neighbours look alike."""
+    held_out = round(len(frames) * share)
+    if len(frames) - held_out < 1:
+        raise JaxmapError(
+            f"{len(frames)} frames can be used, and {held_out} of them are held out",
+            where=name,
+            fix="give a longer sequence, or a smaller --data.validation-share",
+        )
+    return frames[: len(frames) - held_out], frames[len(frames) - held_out :]
+
+
+def _check_shown(counts: np.ndarray, data: MapData, config: TrainConfig) -> None:
+    """Refuses a ground truth that teaches nothing.
+
+    Raises:
+        JaxmapError: the cells that the frames see are not labelled, or all are of one class.
+    """
+    shown = [index for index in data.truth.rasters if counts[index]]
+    if len(shown) > 1:
+        return
+    what = "no cell that the frames see is labelled"
+    if shown:
+        what = f"all labelled cells that the frames see are {config.classes[shown[0]]}: one class teaches nothing"
+    raise JaxmapError(
+        what,
+        where=config.ground_truth,
+        fix="check that both are of one site and the poses true, or take a longer sequence",
+    )
+
+
+def _losses(config: TrainConfig, counts: np.ndarray, shown: Iterable[int]) -> dict[int, LossOptions]:
+    """The loss of each class against the rest, from the settings of losses of pixels."""
+    weights = class_weights(config.loss, counts)
+    losses = {}
+    for index in shown:
+        others = [weights[other] for other in shown if other != index]
+        losses[index] = LossOptions(
+            nll=config.loss.cross_entropy,
+            soft_iou=config.loss.soft_iou,
+            class_weight=float(weights[index] / np.mean(others)),
+        )
+    return losses
+
+
+def _told(data: MapData, counts: np.ndarray) -> str:
+    """One line on frames and truth."""
+    classes, seen = data.plan.labeller.classes, int(counts.sum())
+    pixels = sum(kept.cells.size for kept in data.train)
+    shares = ", ".join(f"{classes[index]} {counts[index] / seen:.1%}" for index in data.truth.rasters)
+    return (
+        f"{len(data.train)} frames to map, {len(data.validation)} to validate; "
+        f"{seen / pixels:.0%} of their pixels lie in labelled cells: {shares}"
+    )
