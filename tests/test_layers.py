@@ -77,6 +77,7 @@ SAME_FLOOR = {
     ("jaxmap.config", "jaxmap.settings"),
     ("jaxmap.training_config", "jaxmap.settings"),
     ("jaxmap.training", "jaxmap.evaluation"),
+    ("jaxmap.tuning", "jaxmap.evaluation"),
     ("jaxmap.training_folder", "jaxmap.output_folder"),
     ("jaxmap.training_folder", "jaxmap.training_log"),
     ("jaxmap.training_folder", "jaxmap.training_plan"),
