@@ -112,6 +112,8 @@ class PlaneConfig:
 
     threshold_m: Positive = 0.1
     """Points farther from the plane are rock."""
+    softness_m: Annotated[float, Ge(0)] = 0.0
+    """Width of the passage from sand to rock around the threshold; at 0 it is sharp."""
     max_height_m: Positive = 2.0
     """Points farther still are left out."""
     on_plane: str = "sand"

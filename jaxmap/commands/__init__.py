@@ -7,6 +7,7 @@ COMMANDS: dict[str, str] = {
     "map": "map a stereo sequence",
     "train": "train or fine-tune DeepLabv3+ on images and masks",
     "evaluate": "score a map against an orthomosaic labelled from above",
+    "tune": "tune the numbers of fusion against ground truth",
     "segment": "label images with a network, and score the labels",
     "simulate": "render a traverse, or training images, of a simulated world",
     "weights": "convert or download pretrained networks",
