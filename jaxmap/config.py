@@ -95,6 +95,9 @@ class FusionConfig:
     """A voxel is occupied above this probability."""
     class_threshold: Probability = 0.5
     """A priority class wins above this probability."""
+    class_kernel: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    """One odd square a class: how much of the evidence of neighbouring columns counts when the map is read; tune
+    --kernel learns it."""
 
 
 DEFAULT_PRIORITY = ("rock",)

@@ -45,6 +45,8 @@ def tuned_tree(config: MapConfig, params: TunedParams) -> dict[str, Any]:
         "occupancy_threshold": _plain(fusion.occupancy_threshold),
         "class_threshold": _plain(fusion.class_threshold),
     }
+    if fusion.class_kernel is not None:
+        tree["fusion"]["class_kernel"] = _plain(fusion.class_kernel)
     for name, value in params.labeller.items():
         tree[_SECTION[name]] = tree[_SECTION[name]] | {name: _plain(value)}
     check_config(tree, "the tuned configuration")

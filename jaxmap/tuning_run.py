@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,11 @@ import numpy as np
 import jaxmap
 from jaxmap.config import MapConfig
 from jaxmap.errors import UsageError
+from jaxmap.files import atomic_path
 from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
 from jaxmap.mapping_plan import Plan, Tell, plan_run
 from jaxmap.output_folder import write_json, write_yaml
+from jaxmap.report.tuning_page import tuning_page
 from jaxmap.sequence import prepare_frames
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
 from jaxmap.tuning.descent import DescentOptions, Step, descend
@@ -28,6 +30,8 @@ from jaxmap.tuning_config import tuned_tree
 
 SOFT_START_M = 0.03
 """Where the width of the plane's threshold starts when the settings have a sharp one, which nothing can move."""
+
+MAX_KERNEL = 9
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class TuneOptions:
         held_out_share: of the ground, kept from the descent and used to stop it.
         block_px: see `evidence_cache.BLOCK_PX`.
         seed: of what is held out, and of the bootstrap.
+        kernel: size of a kernel over neighbouring columns, learnt in a second descent; 0 for none.
     """
 
     descent: DescentOptions = field(default_factory=DescentOptions)
@@ -51,6 +56,16 @@ class TuneOptions:
     held_out_share: float = 0.25
     block_px: int = BLOCK_PX
     seed: int = 0
+    kernel: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses what makes no sense."""
+        if self.kernel and (self.kernel % 2 == 0 or not 3 <= self.kernel <= MAX_KERNEL):
+            raise UsageError(f"kernel is {self.kernel}", where="tuning", fix=f"give an odd size from 3 to {MAX_KERNEL}")
+        if not 0 < self.held_out_share < 1:
+            raise UsageError(
+                f"held_out_share is {self.held_out_share}", where="tuning", fix="give a share between 0 and 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -105,7 +120,6 @@ class TuningRun:
             )
         self._target = classes.index(truth.target)
         self.frames = sum(len(plan.sequence.frames) for plan in self._plans)
-        self.history: list[dict[str, float]] = []
         self._traverses: list[Traverse] = []
 
     def cache(self, advance: Callable[[int], None]) -> None:
@@ -164,13 +178,40 @@ class TuningRun:
         Raises:
             JaxmapError: the loss diverges, or writing failed; what was best before is kept.
         """
-        tunable = tunable_labels(self._traverses[0].recipe)
-        before = self._start()
-        start = before
+        before = start = self._start()
         if start.labeller.get("softness_m") == 0.0:
             start = start._replace(labeller=start.labeller | {"softness_m": jnp.asarray(SOFT_START_M)})
-        limits = tunable.limits
+        stages = [self._stage("tuned", before, start, advance)]
+        if self._options.kernel:
+            start = stages[-1].params
+            middle = np.zeros((self._options.kernel,) * 2)
+            middle[self._options.kernel // 2, self._options.kernel // 2] = 1.0
+            kernel = jnp.asarray(np.broadcast_to(middle, (len(self._plans[0].labeller.classes), *middle.shape)))
+            start = start._replace(fusion=replace(start.fusion, class_kernel=kernel.astype(jnp.float32)))
+
+            def further(step: int, note: str) -> None:
+                advance(self._options.descent.steps + step, note)
+
+            stages.append(self._stage("with kernel", before, start, further))
+        self._write_config(stages[-1].params)
+        result = {
+            "jaxmap_version": jaxmap.__version__,
+            "class": self._truth.target,
+            "labeller": self._plans[0].labeller.name,
+            "traverses": self._told_traverses(),
+            "before": plain(before),
+            "stages": [stage.told for stage in stages],
+        }
+        write_json(self._out.with_suffix(".json"), result)
+        with atomic_path(self._out.with_suffix(".html")) as temporary:
+            temporary.write_text(tuning_page(self._out.stem, result), encoding="utf-8")
+        return result
+
+    def _stage(self, name: str, before: TunedParams, start: TunedParams, advance: Callable[[int, str], None]) -> _Stage:
+        """One descent from `start`, the best so far written at every step; told beside `before`."""
+        limits = tunable_labels(self._traverses[0].recipe).limits
         free = to_free(start, limits)
+        history: list[dict[str, float]] = []
 
         @jax.jit
         def loss(free: TunedParams) -> tuple[jax.Array, jax.Array]:
@@ -180,14 +221,32 @@ class TuningRun:
             return tuned, jnp.stack([held for _, (held, _) in both]).mean()
 
         def on_step(step: Step) -> None:
-            self.history.append({"step": step.number, "loss": step.losses.tuned, "held_out": step.losses.held_out})
+            history.append({"step": step.number, "loss": step.losses.tuned, "held_out": step.losses.held_out})
             if step.best:
                 self._write_config(to_legal(step.free, limits))
             advance(step.number, f"loss {step.losses.tuned:.4f}, held out {step.losses.held_out:.4f}")
 
         best = descend(loss, free, self._options.descent, moves=self._moves(free), on_step=on_step)
         after = to_legal(best.free, limits)
-        return self._finish(before, after, best)
+        told: dict[str, Any] = {"name": name, "best_step": best.number, "parameters": plain(after), "history": history}
+        told |= {"scores": {}, "calibration": {}}
+        for part, wanted in (("held_out", True), ("tuned_on", False)):
+            old, new = (self._scored(params, wanted) for params in (_hard(before), after))
+            told["scores"][part] = score_with_intervals(old, new, seed=self._options.seed)
+            told["calibration"][part] = {"before": calibration_rows(old), "after": calibration_rows(new)}
+        return _Stage(after, told)
+
+    def _told_traverses(self) -> list[dict[str, Any]]:
+        return [
+            {
+                "sequence": plan.source,
+                "ground_truth": str(source.truth),
+                "frames": len(plan.sequence.frames),
+                "cells": int(np.asarray(one.truth.counted).sum()),
+                "held_out_cells": int((np.asarray(one.truth.counted) & one.held_out).sum()),
+            }
+            for plan, source, one in zip(self._plans, self._sources, self._traverses, strict=True)
+        ]
 
     def _start(self) -> TunedParams:
         numbers = tunable_labels(self._traverses[0].recipe).numbers
@@ -213,45 +272,21 @@ class TuningRun:
     def _write_config(self, params: TunedParams) -> None:
         write_yaml(self._out, tuned_tree(self._config, params))
 
-    def _scored(self, params: TunedParams, wanted: bool | None) -> ScoredCells:
-        """The cells of all traverses; only those held out, or tuned on, where asked."""
+    def _scored(self, params: TunedParams, wanted: bool) -> ScoredCells:
+        """The cells of all traverses that are held out, or that are tuned on."""
         parts = []
         for one in self._traverses:
             cells = score_cells(one, params, self._target)
-            if wanted is not None:
-                mask = one.held_out[np.asarray(one.truth.counted)] == wanted
-                cells = ScoredCells(*(column[mask] for column in cells))
-            parts.append(cells)
+            mask = one.held_out[np.asarray(one.truth.counted)] == wanted
+            parts.append(ScoredCells(*(column[mask] for column in cells)))
         return joined(parts)
 
-    def _finish(self, before: TunedParams, after: TunedParams, best: Step) -> dict[str, Any]:
-        self._write_config(after)
-        result = {
-            "jaxmap_version": jaxmap.__version__,
-            "class": self._truth.target,
-            "labeller": self._plans[0].labeller.name,
-            "traverses": [
-                {
-                    "sequence": plan.source,
-                    "ground_truth": str(source.truth),
-                    "frames": len(plan.sequence.frames),
-                    "cells": int(np.asarray(one.truth.counted).sum()),
-                    "held_out_cells": int((np.asarray(one.truth.counted) & one.held_out).sum()),
-                }
-                for plan, source, one in zip(self._plans, self._sources, self._traverses, strict=True)
-            ],
-            "best_step": best.number,
-            "history": self.history,
-            "scores": {},
-            "calibration": {},
-            "parameters": {"before": plain(before), "after": plain(after)},
-        }
-        for part, wanted in (("held_out", True), ("tuned_on", False)):
-            old, new = (self._scored(params, wanted) for params in (_hard(before), after))
-            result["scores"][part] = score_with_intervals(old, new, seed=self._options.seed)
-            result["calibration"][part] = {"before": calibration_rows(old), "after": calibration_rows(new)}
-        write_json(self._out.with_suffix(".json"), result)
-        return result
+
+class _Stage(NamedTuple):
+    """What a descent came to, and what is told of it."""
+
+    params: TunedParams
+    told: dict[str, Any]
 
 
 def plain(params: TunedParams) -> dict[str, Any]:

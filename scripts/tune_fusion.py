@@ -102,13 +102,13 @@ def tuned(labels: str, given: argparse.Namespace, kernel: int, out: Path) -> Map
         )
         for one in given.tune
     ]
-    run = TuningRun(sources, config, TruthOptions(), TuneOptions(), out, tell=lambda line: None)
+    run = TuningRun(sources, config, TruthOptions(), TuneOptions(kernel=kernel), out, tell=lambda line: None)
     run.cache(lambda done: None)
     cached_s = time.perf_counter()
     result = run.tune(lambda step, note: None)
     print(
         f"{labels}{' with kernel' * bool(kernel)}: {run.frames} frames cached in {cached_s - started_s:.0f} s, "
-        f"{len(result['history'])} steps in {time.perf_counter() - cached_s:.0f} s, best {result['best_step']}",
+        f"{sum(len(stage['history']) for stage in result['stages'])} steps in {time.perf_counter() - cached_s:.0f} s",
         flush=True,
     )
     return load_config(str(out))

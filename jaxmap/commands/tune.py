@@ -51,6 +51,8 @@ class TuneArguments:
     """Weight of 1 - soft IoU, beside the negative log-likelihood."""
     held_out_share: float = 0.25
     """Share of the ground that is held out, in blocks of 2 m and whole rocks."""
+    kernel: int = 0
+    """Learn a kernel of so many columns a side (3, 5, 7, 9) for each class in a second descent, and write it too."""
     frozen: tuple[str, ...] = ()
     """Names of parameters that stay as they are, such as disparity_sigma_px."""
     cell_size_m: float = 0.2
@@ -104,6 +106,7 @@ def main(words: Sequence[str]) -> int:
         arguments.cell_size_m,
         arguments.held_out_share,
         seed=config.seed,
+        kernel=arguments.kernel,
     )
     run = TuningRun(
         [Source(*row) for row in rows],
@@ -115,7 +118,7 @@ def main(words: Sequence[str]) -> int:
     )
     with console.steps("reading", "frames", run.frames) as advance:
         run.cache(advance)
-    with console.steps("tuning", "steps", arguments.steps) as advance:
+    with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
         result = run.tune(advance)
     _print(console, result)
     out = arguments.out
@@ -153,16 +156,17 @@ def _beside(out: Path, suffix: str) -> Path:
 
 def _print(console: Console, result: dict) -> None:
     columns = {"score": "held-out ground", "before": "before", "after": "after", "change": "change (90 % interval)"}
-    rows = [
-        {
-            "score": name,
-            "before": _text(row["before"]),
-            "after": _text(row["after"]),
-            "change": f"{_text(row['change'])} ({', '.join(map(_text, row['change_interval'] or (None, None)))})",
-        }
-        for name, row in result["scores"]["held_out"].items()
-    ]
-    console.table(f"{result['class']}, best after {result['best_step']} steps", columns, rows)
+    for stage in result["stages"]:
+        rows = [
+            {
+                "score": name,
+                "before": _text(row["before"]),
+                "after": _text(row["after"]),
+                "change": f"{_text(row['change'])} ({' to '.join(map(_text, row['change_interval'] or (None, None)))})",
+            }
+            for name, row in stage["scores"]["held_out"].items()
+        ]
+        console.table(f"{result['class']}, {stage['name']}, best after {stage['best_step']} steps", columns, rows)
 
 
 def _text(value: float | None) -> str:

@@ -70,6 +70,27 @@ def own_label_above() -> Bijection:
     return Bijection(legal, free)
 
 
+def rings(low: float, high: float) -> Bijection:
+    """Kernels (C, K, K) of 1 in the middle and one weight a ring around it, strictly between two bounds.
+
+    Elements equally far from the middle weigh the same: a kernel must not know which way the rover drove.
+    """
+    inner = between(low, high)
+
+    def ring_of(size: int) -> np.ndarray:
+        squares = (np.arange(size) - size // 2) ** 2
+        return np.unique(squares[:, None] + squares, return_inverse=True)[1].reshape(size, size)
+
+    def legal(x: Array) -> Array:
+        ring = ring_of(x.shape[1])
+        # (rings, K, K): the mean over each ring, and back to its elements.
+        members = (ring == np.arange(ring.max() + 1)[:, None, None]).astype(np.float32)
+        means = jnp.einsum("rij,cij->cr", members / members.sum(axis=(1, 2), keepdims=True), x)
+        return jnp.where(ring == 0, 1.0, inner.legal(means)[:, ring])
+
+    return Bijection(legal, inner.free)
+
+
 _PRIOR, _APART = between(-4.0, 4.0), positive(1e-3, 20.0)
 _ABOVE_PRIOR = positive(1e-2, 6.0)
 
@@ -79,6 +100,7 @@ FUSION: dict[str, Bijection] = {
     "disparity_sigma_px": positive(1e-3, 50.0),
     "full_evidence_points": positive(0.1, 1e4),
     "class_threshold": between(1e-3, 1.0 - 1e-3),
+    "class_kernel": rings(-0.5, 1.0),
 }
 """The bijection of each field of `FusionParams` that stands alone; the numbers of occupancy go together."""
 
