@@ -119,6 +119,11 @@ class TuningRun:
                 fix="name one of them, or choose another --labeller",
             )
         self._target = classes.index(truth.target)
+        names = plain(self._start())
+        if unknown := [name for name in options.frozen if name not in names]:
+            raise UsageError(
+                f"no parameter {', '.join(unknown)}", where="--frozen", fix=f"name some of {' '.join(names)}"
+            )
         self.frames = sum(len(plan.sequence.frames) for plan in self._plans)
         self._traverses: list[Traverse] = []
 
@@ -209,7 +214,7 @@ class TuningRun:
 
     def _stage(self, name: str, before: TunedParams, start: TunedParams, advance: Callable[[int, str], None]) -> _Stage:
         """One descent from `start`, the best so far written at every step; told beside `before`."""
-        limits = tunable_labels(self._traverses[0].recipe).limits
+        limits = tunable_labels(self._plans[0].labeller, self._plans[0].rule).limits
         free = to_free(start, limits)
         history: list[dict[str, float]] = []
 
@@ -249,18 +254,14 @@ class TuningRun:
         ]
 
     def _start(self) -> TunedParams:
-        numbers = tunable_labels(self._traverses[0].recipe).numbers
+        plan = self._plans[0]
+        numbers = tunable_labels(plan.labeller, plan.rule).numbers
         return TunedParams(
-            self._plans[0].params.fusion, {name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()}
+            plan.params.fusion, {name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()}
         )
 
     def _moves(self, free: TunedParams) -> TunedParams:
         """1 for what moves, 0 for what is frozen or acts on nothing under the rule."""
-        names = {**asdict(free.fusion), **free.labeller}
-        if unknown := [name for name in self._options.frozen if name not in names]:
-            raise UsageError(
-                f"no parameter {', '.join(unknown)}", where="--frozen", fix=f"name some of {' '.join(names)}"
-            )
 
         def of(name: str, leaf: Any) -> Any:
             return None if leaf is None else jnp.full_like(leaf, name not in self._options.frozen)

@@ -87,7 +87,7 @@ def descend(
         if moves is not None:
             gradient = jax.tree.map(jnp.multiply, gradient, moves)
         updates, state = optimiser.update(gradient, state, free)
-        finite = jnp.isfinite(optax.global_norm(gradient))
+        finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all()
         return optax.apply_updates(free, updates), state, (tuned, held_out, finite)
 
     free, state = start, optimiser.init(start)

@@ -119,10 +119,9 @@ def build_cache(
     return _joined(kept, shared, freed)
 
 
-def tunable_labels(recipe: CacheRecipe) -> TunableLabels:
+def tunable_labels(labeller: Labeller, rule: FusionRule) -> TunableLabels:
     """The labeller in two parts; where the rule counts hard labels, no number of it changes them smoothly."""
-    labeller = recipe.labeller
-    if recipe.rule.per_frame == "once":
+    if rule.per_frame == "once":
         return fixed_labels(lambda *inputs: (harden(labeller.label(*inputs)[0]), None))
     return labeller.tunable or fixed_labels(labeller.label)
 
@@ -131,7 +130,7 @@ def _observer(recipe: CacheRecipe) -> Any:
     """The compiled front of the mapper: where the points of a frame lie, and their cues."""
     low_m, high_m = recipe.depth_range_m
     size = window_shape(recipe.grid, recipe.camera, high_m)
-    tunable = tunable_labels(recipe)
+    tunable = tunable_labels(recipe.labeller, recipe.rule)
 
     @jax.jit
     def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> dict[str, Any]:
@@ -242,7 +241,9 @@ def fused_evidence(
         row = jnp.where(known, cache.labels, classes)
         counts = jnp.zeros((classes + 1) * pairs, weights.dtype).at[row * pairs + cache.pair].add(weights)
     else:
-        soft = tunable_labels(recipe).probabilities(cache.values, cache.frame, cache.shared, numbers)
+        soft = tunable_labels(recipe.labeller, recipe.rule).probabilities(
+            cache.values, cache.frame, cache.shared, numbers
+        )
         shares = [*(soft[:, index] for index in range(classes)), 1.0 - soft.sum(axis=-1)]
         # One flat scatter for each class is thrice as fast as scattering rows.
         counts = jnp.stack([empty.at[cache.pair].add(share * weights) for share in shares])
