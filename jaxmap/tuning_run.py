@@ -25,7 +25,14 @@ from jaxmap.tuning.descent import DescentOptions, Step, descend
 from jaxmap.tuning.evidence_cache import BLOCK_PX, CacheRecipe, build_cache, tunable_labels
 from jaxmap.tuning.map_loss import LossOptions
 from jaxmap.tuning.parametrisation import TunedParams, to_free, to_legal
-from jaxmap.tuning.traverse_loss import Traverse, check_classes, make_traverse, score_cells, traverse_losses
+from jaxmap.tuning.traverse_loss import (
+    Traverse,
+    TraverseArrays,
+    check_classes,
+    make_traverse,
+    score_cells,
+    traverse_losses,
+)
 from jaxmap.tuning_config import tuned_tree
 
 SOFT_START_M = 0.03
@@ -218,10 +225,10 @@ class TuningRun:
         free = to_free(start, limits)
         history: list[dict[str, float]] = []
 
-        @jax.jit
-        def loss(free: TunedParams) -> tuple[jax.Array, jax.Array]:
+        def loss(free: TunedParams, arrays: list[TraverseArrays]) -> tuple[jax.Array, jax.Array]:
             legal = to_legal(free, limits)
-            both = [traverse_losses(one, legal, self._target, self._options.loss) for one in self._traverses]
+            traverses = [replace(one, arrays=mine) for one, mine in zip(self._traverses, arrays, strict=True)]
+            both = [traverse_losses(one, legal, self._target, self._options.loss) for one in traverses]
             tuned = jnp.stack([tuned for (tuned, _), _ in both]).mean()
             return tuned, jnp.stack([held for _, (held, _) in both]).mean()
 
@@ -231,14 +238,18 @@ class TuningRun:
                 self._write_config(to_legal(step.free, limits))
             advance(step.number, f"loss {step.losses.tuned:.4f}, held out {step.losses.held_out:.4f}")
 
-        best = descend(loss, free, self._options.descent, moves=self._moves(free), on_step=on_step)
+        data = ([one.arrays for one in self._traverses],)
+        best = descend(loss, free, self._options.descent, data=data, moves=self._moves(free), on_step=on_step)
         after = to_legal(best.free, limits)
         told: dict[str, Any] = {"name": name, "best_step": best.number, "parameters": plain(after), "history": history}
         told |= {"scores": {}, "calibration": {}}
+        old, new = (
+            [score_cells(one, params, self._target) for one in self._traverses] for params in (_hard(before), after)
+        )
         for part, wanted in (("held_out", True), ("tuned_on", False)):
-            old, new = (self._scored(params, wanted) for params in (_hard(before), after))
-            told["scores"][part] = score_with_intervals(old, new, seed=self._options.seed)
-            told["calibration"][part] = {"before": calibration_rows(old), "after": calibration_rows(new)}
+            one, other = (self._part(cells, wanted) for cells in (old, new))
+            told["scores"][part] = score_with_intervals(one, other, seed=self._options.seed)
+            told["calibration"][part] = {"before": calibration_rows(one), "after": calibration_rows(other)}
         return _Stage(after, told)
 
     def _told_traverses(self) -> list[dict[str, Any]]:
@@ -247,8 +258,8 @@ class TuningRun:
                 "sequence": plan.source,
                 "ground_truth": str(source.truth),
                 "frames": len(plan.sequence.frames),
-                "cells": int(np.asarray(one.truth.counted).sum()),
-                "held_out_cells": int((np.asarray(one.truth.counted) & one.held_out).sum()),
+                "cells": int(np.asarray(one.arrays.truth.counted).sum()),
+                "held_out_cells": int(np.asarray(one.arrays.truth.counted & one.arrays.held_out).sum()),
             }
             for plan, source, one in zip(self._plans, self._sources, self._traverses, strict=True)
         ]
@@ -273,13 +284,12 @@ class TuningRun:
     def _write_config(self, params: TunedParams) -> None:
         write_yaml(self._out, tuned_tree(self._config, params))
 
-    def _scored(self, params: TunedParams, wanted: bool) -> ScoredCells:
-        """The cells of all traverses that are held out, or that are tuned on."""
+    def _part(self, cells: list[ScoredCells], held_out: bool) -> ScoredCells:
+        """Of the cells of all traverses, those that are held out, or those tuned on."""
         parts = []
-        for one in self._traverses:
-            cells = score_cells(one, params, self._target)
-            mask = one.held_out[np.asarray(one.truth.counted)] == wanted
-            parts.append(ScoredCells(*(column[mask] for column in cells)))
+        for one, mine in zip(self._traverses, cells, strict=True):
+            mask = np.asarray(one.arrays.held_out)[np.asarray(one.arrays.truth.counted)] == held_out
+            parts.append(ScoredCells(*(column[mask] for column in mine)))
         return joined(parts)
 
 

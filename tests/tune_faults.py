@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from fixtures import GRID
 from scenes import BOXES_M, ROCK, SAND
-from truth_files import CRS, write_raster
+from truth_files import write_raster
 
 PIXEL_M, WEST_M, NORTH_M = 0.05, -3.0, 7.0
 SIZE = (160, 120)
@@ -93,7 +93,6 @@ TUNE_FAULTS: dict[str, tuple[int, Damage]] = {
     "tune: truth missing": (1, truth_missing),
     "tune: truth is no raster": (1, no_raster),
     "tune: truth of another place": (1, with_truth(west=5000.0)),
-    "tune: truth in another system": (1, with_truth(crs=CRS)),
     "tune: nothing labelled": (1, with_truth(np.zeros_like)),
     "tune: labelled only where nothing was seen": (
         1,

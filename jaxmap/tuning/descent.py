@@ -58,19 +58,21 @@ class Step(NamedTuple):
 
 
 def descend(
-    loss: Callable[[PyTree], tuple[jax.Array, jax.Array]],
+    loss: Callable[..., tuple[jax.Array, jax.Array]],
     start: PyTree,
     options: DescentOptions,
     *,
+    data: tuple[PyTree, ...] = (),
     moves: PyTree | None = None,
     on_step: Callable[[Step], None] = lambda step: None,
 ) -> Step:
     """Descends from `start`, and returns the step of the least held-out loss; the first one is the start itself.
 
     Args:
-        loss: free numbers to the loss that is descended and the held-out one; differentiable in the first.
+        loss: `(free, *data)` to the loss that is descended and the held-out one; differentiable in the free numbers.
         start: free numbers.
         options: see there.
+        data: what the loss is of, handed to it at every step: closed over, it would be compiled in as constants.
         moves: a tree like `start` of 1 for numbers that move and 0 for those that stay; all move by default.
         on_step: is called at every step.
 
@@ -82,8 +84,8 @@ def descend(
     optimiser = optax.chain(optax.clip_by_global_norm(options.max_norm), optax.adam(schedule))
 
     @jax.jit
-    def advance(free: PyTree, state: PyTree) -> tuple[PyTree, PyTree, tuple[jax.Array, ...]]:
-        (tuned, held_out), gradient = jax.value_and_grad(loss, has_aux=True)(free)
+    def advance(free: PyTree, state: PyTree, data: tuple) -> tuple[PyTree, PyTree, tuple[jax.Array, ...]]:
+        (tuned, held_out), gradient = jax.value_and_grad(loss, has_aux=True)(free, *data)
         if moves is not None:
             gradient = jax.tree.map(jnp.multiply, gradient, moves)
         updates, state = optimiser.update(gradient, state, free)
@@ -93,7 +95,7 @@ def descend(
     free, state = start, optimiser.init(start)
     best, first = None, math.inf
     for number in range(options.steps + 1):
-        moved, state, (tuned, held_out, finite) = advance(free, state)
+        moved, state, (tuned, held_out, finite) = advance(free, state, data)
         losses = Losses(float(tuned), float(held_out))
         if number == 0:
             first = abs(losses.tuned) + 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,17 @@ from jaxmap.tuning.soft_view import columns_of_list, soft_columns
 from jaxmap.tuning.split import ground_groups, hold_out
 
 
+class TraverseArrays(NamedTuple):
+    """What a loss is computed from.
+
+    `truth` counts cells that some frame hit and that are labelled; `held_out` are cells kept from tuning.
+    """
+
+    cache: EvidenceCache
+    truth: MapTruth
+    held_out: Bool[Array, "I J"]
+
+
 @dataclass(frozen=True, eq=False)
 class Traverse:
     """One traverse, ready to be tuned on.
@@ -28,18 +40,14 @@ class Traverse:
     Attributes:
         name: for texts.
         recipe: what its cache was made for.
-        cache: its evidence.
-        truth: ground truth, the cells that count being those that some frame hit and that are labelled.
-        held_out: cells kept from tuning.
+        arrays: what its loss is computed from.
         groups: rock or block of ground of each cell.
         rock_fraction: share from which on a cell is of the class.
     """
 
     name: str
     recipe: CacheRecipe
-    cache: EvidenceCache
-    truth: MapTruth
-    held_out: Bool[np.ndarray, "I J"]
+    arrays: TraverseArrays
     groups: Int[np.ndarray, "I J"]
     rock_fraction: float
 
@@ -79,7 +87,8 @@ def make_traverse(
     groups = ground_groups(fine, cells)
     held_out = hold_out(groups, fine.truly(rock_fraction), counted, held_out_share, seed)
     truth = truth._replace(counted=jnp.asarray(counted))
-    return Traverse(name, recipe, cache, truth, held_out, groups, rock_fraction)
+    arrays = TraverseArrays(cache, truth, jnp.asarray(held_out))
+    return Traverse(name, recipe, arrays, groups, rock_fraction)
 
 
 def check_classes(traverses: list[Traverse], target: str) -> None:
@@ -89,9 +98,10 @@ def check_classes(traverses: list[Traverse], target: str) -> None:
         JaxmapError: all cells that count, tuned or held out, are of the class or none is.
     """
     for part, wanted in (("to tune on", False), ("held out", True)):
-        here = [np.asarray(one.truth.counted) & (one.held_out == wanted) for one in traverses]
+        every = [one.arrays for one in traverses]
+        here = [np.asarray(one.truth.counted & (one.held_out == wanted)) for one in every]
         cells = sum(int(mask.sum()) for mask in here)
-        of_class = sum(int((np.asarray(one.truth.truly)[m] > 0).sum()) for one, m in zip(traverses, here, strict=True))
+        of_class = sum(int((np.asarray(one.truth.truly)[m] > 0).sum()) for one, m in zip(every, here, strict=True))
         if of_class in (0, cells):
             raise JaxmapError(
                 f"of {cells} cells {part}, {of_class} are {target}: both kinds are needed",
@@ -105,14 +115,13 @@ def traverse_losses(
 ) -> tuple[tuple[Array, LossParts], tuple[Array, LossParts]]:
     """The loss of the ground to tune on, and of the ground held out; each with its parts."""
     said = _said(traverse, params, target, options)
-    held = jnp.asarray(traverse.held_out)
-    counted = traverse.truth.counted
-    tuned, kept = (cells_loss(said, traverse.truth._replace(counted=counted & mask), options) for mask in (~held, held))
+    truth, held = traverse.arrays.truth, traverse.arrays.held_out
+    tuned, kept = (cells_loss(said, truth._replace(counted=truth.counted & mask), options) for mask in (~held, held))
     return tuned, kept
 
 
 def _said(traverse: Traverse, params: TunedParams, target: int, options: LossOptions) -> SoftCells:
-    recipe, cache = traverse.recipe, traverse.cache
+    recipe, cache = traverse.recipe, traverse.arrays.cache
     evidence = fused_evidence(recipe, cache, params.fusion, params.labeller)
     columns = soft_columns(
         evidence,
@@ -125,7 +134,7 @@ def _said(traverse: Traverse, params: TunedParams, target: int, options: LossOpt
         options.softness,
     )
     prior = jax.nn.sigmoid(params.fusion.class_prior[target])
-    return soft_cells(columns, traverse.truth.shares, prior, options)
+    return soft_cells(columns, traverse.arrays.truth.shares, prior, options)
 
 
 def score_cells(traverse: Traverse, params: TunedParams, target: int) -> ScoredCells:
@@ -134,15 +143,18 @@ def score_cells(traverse: Traverse, params: TunedParams, target: int) -> ScoredC
     Cells that the parameters leave unobserved count, as not called: no numbers gain by refusing to look.
     """
     recipe = traverse.recipe
-    evidence = fused_evidence(recipe, traverse.cache, params.fusion, params.labeller)
-    view = top_down(map_of_cache(recipe, traverse.cache, evidence), params.fusion, recipe.rule)
+    evidence = _fused(recipe, traverse.arrays.cache, params.fusion, params.labeller)
+    view = top_down(map_of_cache(recipe, traverse.arrays.cache, evidence), params.fusion, recipe.rule)
     prior = float(jax.nn.sigmoid(params.fusion.class_prior[target]))
     is_class = (view.label == target) & view.observed
-    said: MapCells = map_cells(is_class, view.probability[target], view.observed, traverse.truth.shares, prior)
-    counted = np.asarray(traverse.truth.counted)
+    said: MapCells = map_cells(is_class, view.probability[target], view.observed, traverse.arrays.truth.shares, prior)
+    counted = np.asarray(traverse.arrays.truth.counted)
     return ScoredCells(
         said.called(traverse.rock_fraction)[counted],
         np.asarray(said.probability)[counted],
-        np.asarray(traverse.truth.truly)[counted] > 0,
+        np.asarray(traverse.arrays.truth.truly)[counted] > 0,
         traverse.groups[counted],
     )
+
+
+_fused = jax.jit(fused_evidence, static_argnums=0)

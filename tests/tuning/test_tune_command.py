@@ -65,13 +65,13 @@ def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
 def test_what_was_best_is_on_disk_when_it_breaks(cli, scene_folder, truth, tmp_path, monkeypatch):
     real, out = jaxmap.tuning_run.descend, tmp_path / "fusion.yaml"
 
-    def breaking(loss, start, options, *, moves, on_step):
+    def breaking(loss, start, options, *, data, moves, on_step):
         def stop_later(step):
             on_step(step)
             if step.number == 2:
                 raise JaxmapError("the loss diverges", where="tuning", fix="take a lower --learning-rate")
 
-        return real(loss, start, options, moves=moves, on_step=stop_later)
+        return real(loss, start, options, data=data, moves=moves, on_step=stop_later)
 
     monkeypatch.setattr(jaxmap.tuning_run, "descend", breaking)
     outcome = cli(*tune_words(scene_folder, truth, out, *SHORT))
