@@ -166,7 +166,8 @@ def make_plane_labeller(
     of_refit = {name: options[name] for name in ("outlier_range_m", "max_tilt_rad", "em_rounds")}
 
     def cues(frame: Frame, points_world: Array, valid: Array, params: PlaneParams, key: Array) -> Cues:
-        start = search_plane(key, points_world, valid, **(up | options | {"sigma_m": params.sigma_m}))
+        search: dict[str, Any] = {**up, **options, "sigma_m": params.sigma_m}
+        start = search_plane(key, points_world, valid, **search)
         plane = refit_plane(start, sigma_m=params.sigma_m, **up, **of_refit)
         off = jnp.abs(plane_distance(plane, points_world))
         return Cues(valid & ((off <= max_height_m) | ~plane.found), points_world, shared=start)

@@ -201,8 +201,9 @@ def _kernels(count: int, class_kernel: ArrayLike) -> np.ndarray:
         kernels = np.asarray(class_kernel, np.float64)
     except ValueError:
         kernels = np.full((), np.nan)
-    odd = kernels.ndim == 3 and kernels.shape[1] == kernels.shape[2] and kernels.shape[1] % 2 == 1
-    if not odd or kernels.shape[0] != count or not np.isfinite(kernels).all():
+    shape: tuple[int, ...] = kernels.shape
+    odd = len(shape) == 3 and shape[1] == shape[2] and shape[1] % 2 == 1
+    if not odd or shape[0] != count or not np.isfinite(kernels).all():
         raise JaxmapError(
             f"class_kernel is not {count} finite squares of one odd size",
             where="fusion",

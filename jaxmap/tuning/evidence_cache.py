@@ -41,7 +41,7 @@ class EvidenceCache(NamedTuple):
         values: mean cue of each kept point.
         labels: its class where no number changes it, or None; -1 for none.
         depth_m: mean depth.
-        count: how many points it stands for.
+        points: how many points it stands for.
         frame: index of its frame.
         pair: index of its frame and voxel.
         voxel_of_pair: index of each pair's voxel among the V.
@@ -53,7 +53,7 @@ class EvidenceCache(NamedTuple):
     values: Float[Array, "G D"]
     labels: Int[Array, "G"] | None
     depth_m: Float[Array, "G"]
-    count: Float[Array, "G"]
+    points: Float[Array, "G"]
     frame: Int[Array, "G"]
     pair: Int[Array, "G"]
     voxel_of_pair: Int[Array, "P"]
@@ -78,7 +78,7 @@ class _Kept(NamedTuple):
 
     voxel: np.ndarray
     depth_m: np.ndarray
-    count: np.ndarray
+    points: np.ndarray
     labels: np.ndarray | None
     values: np.ndarray
 
@@ -207,7 +207,7 @@ def _joined(kept: list[_Kept], shared: list[PyTree], freed: np.ndarray) -> Evide
         values=together("values"),
         labels=None if kept[0].labels is None else together("labels"),
         depth_m=together("depth_m"),
-        count=together("count"),
+        points=together("points"),
         frame=jnp.asarray(frame, jnp.int32),
         pair=jnp.asarray(pair, jnp.int32),
         voxel_of_pair=jnp.asarray(pairs % len(voxel), jnp.int32),
@@ -232,7 +232,7 @@ def fused_evidence(
         Occupancy, then one row for each class.
     """
     classes, pairs, rule = len(recipe.labeller.classes), cache.voxel_of_pair.shape[0], recipe.rule
-    weights = cache.count
+    weights = cache.points
     if rule.range_weighting:
         weights = weights * range_weight(recipe.camera, recipe.grid, cache.depth_m, fusion)
     empty = jnp.zeros(pairs, weights.dtype)

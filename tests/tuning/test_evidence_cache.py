@@ -116,7 +116,7 @@ def test_keeping_blocks_of_points_as_one_hardly_changes_the_evidence(name):
     every, thinned = (build_cache(recipe, frames, params, KEY, block_px=size) for size in (1, 4))
     assert len(thinned.depth_m) < len(every.depth_m)
     np.testing.assert_array_equal(thinned.voxel, every.voxel)
-    np.testing.assert_allclose(thinned.count.sum(), every.count.sum())
+    np.testing.assert_allclose(thinned.points.sum(), every.points.sum())
     one, other = (fused_evidence(recipe, cache, FUSION, numbers_of(recipe)) for cache in (every, thinned))
     assert np.abs(one - other).max() < 0.05 * np.abs(one).max()
 
