@@ -200,10 +200,9 @@ def _kernels(count: int, class_kernel: ArrayLike) -> np.ndarray:
     try:
         kernels = np.asarray(class_kernel, np.float64)
     except ValueError:
-        kernels = np.full((), np.nan)
-    shape: tuple[int, ...] = kernels.shape
-    odd = len(shape) == 3 and shape[1] == shape[2] and shape[1] % 2 == 1
-    if not odd or shape[0] != count or not np.isfinite(kernels).all():
+        kernels = np.zeros((0, 0, 0))
+    odd = kernels.ndim == 3 and len({*kernels.shape[1:]}) == 1 and kernels.shape[-1] % 2 == 1
+    if not odd or len(kernels) != count or not np.isfinite(kernels).all():
         raise JaxmapError(
             f"class_kernel is not {count} finite squares of one odd size",
             where="fusion",
