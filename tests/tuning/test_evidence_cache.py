@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,14 @@ from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
 from jaxmap.mapper import MapperParams, make_mapper
-from jaxmap.tuning.evidence_cache import CacheRecipe, build_cache, fused_evidence, map_of_cache, tunable_labels
+from jaxmap.tuning.evidence_cache import (
+    CacheRecipe,
+    EvidenceCache,
+    build_cache,
+    fused_evidence,
+    map_of_cache,
+    tunable_labels,
+)
 from jaxmap.tuning.parametrisation import TunedParams, to_free, to_legal
 from jaxmap.types import Frame, make_grid, make_stereo_camera
 
@@ -96,10 +103,10 @@ def test_it_fuses_what_the_mapper_fuses(name, rule):
     for frame in frames:
         voxel_map, info = mapper.step(voxel_map, frame, params, KEY)
         assert int(info.voxels_hit) > 0
-    cache = build_cache(recipe, frames, params, KEY, block_px=1)
-    ours = map_of_cache(recipe, cache, fused_evidence(recipe, cache, FUSION, numbers_of(recipe)))
+    kept = build_cache(recipe, frames, params, KEY, block_px=1)
+    ours = map_of_cache(recipe, kept, fused_evidence(recipe, kept, FUSION, numbers_of(recipe)))
     hit = np.zeros(GRID.shape, bool)
-    hit.reshape(-1)[np.asarray(cache.voxel)] = True
+    hit.reshape(-1)[np.asarray(kept.voxel)] = True
     np.testing.assert_allclose(
         np.where(hit, ours.log_odds, 0), np.where(hit, voxel_map.log_odds, 0), atol=2e-4, err_msg=name
     )
@@ -117,7 +124,7 @@ def test_keeping_blocks_of_points_as_one_hardly_changes_the_evidence(name):
     assert len(thinned.depth_m) < len(every.depth_m)
     np.testing.assert_array_equal(thinned.voxel, every.voxel)
     np.testing.assert_allclose(thinned.points.sum(), every.points.sum())
-    one, other = (fused_evidence(recipe, cache, FUSION, numbers_of(recipe)) for cache in (every, thinned))
+    one, other = (fused_evidence(recipe, kept, FUSION, numbers_of(recipe)) for kept in (every, thinned))
     assert np.abs(one - other).max() < 0.05 * np.abs(one).max()
 
 
@@ -131,21 +138,22 @@ def doubled(tree):
 
 
 @partial(jax.jit, static_argnums=(0, 3))
-def smooth_score(name: str, free: TunedParams, cache, rule: FusionRule) -> jax.Array:
+def smooth_score(name: str, free: TunedParams, kept: EvidenceCache, rule: FusionRule) -> jax.Array:
     recipe = recipe_of(LABELLERS[name], rule)
     params = to_legal(free, tunable_labels(recipe.labeller, recipe.rule).limits)
-    evidence = fused_evidence(recipe, cache, params.fusion, params.labeller)
+    evidence = fused_evidence(recipe, kept, params.fusion, params.labeller)
     weight = np.random.default_rng(9).normal(size=evidence.shape)
     return (weight * jnp.tanh(evidence)).sum()
 
 
 slope_of = jax.jit(jax.grad(smooth_score, argnums=1), static_argnums=(0, 3))
-CACHES = {
-    name: build_cache(
-        recipe_of(labeller, RULES["own"]), frames_of(labeller), MapperParams(CAMERA, FUSION, labeller.params), KEY
-    )
-    for name, labeller in LABELLERS.items()
-}
+
+
+@cache
+def cache_of(name: str) -> EvidenceCache:
+    labeller = LABELLERS[name]
+    params = MapperParams(CAMERA, FUSION, labeller.params)
+    return build_cache(recipe_of(labeller, RULES["own"]), frames_of(labeller), params, KEY)
 
 
 @pytest.mark.parametrize("name", LABELLERS)
@@ -153,13 +161,13 @@ CACHES = {
 @settings(max_examples=5, deadline=None)
 def test_gradients_equal_finite_differences(name, seed):
     recipe = recipe_of(LABELLERS[name], RULES["own"])
-    rng = np.random.default_rng(seed)
+    rng, single = np.random.default_rng(seed), cache_of(name)
     with jax.enable_x64(True):
         start = to_free(TunedParams(FUSION, numbers_of(recipe)), tunable_labels(recipe.labeller, recipe.rule).limits)
         free = jax.tree.map(lambda leaf: jnp.asarray(leaf + rng.normal(0, 0.3, leaf.shape), jnp.float64), start)
-        cache = doubled(CACHES[name])
+        kept = doubled(single)
         leaves, structure = jax.tree.flatten(free)
-        slopes = jax.tree.leaves(slope_of(name, free, cache, RULES["own"]))
+        slopes = jax.tree.leaves(slope_of(name, free, kept, RULES["own"]))
         paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(free)]
         for place, leaf in enumerate(leaves):
             direction = rng.normal(size=leaf.shape)
@@ -167,7 +175,7 @@ def test_gradients_equal_finite_differences(name, seed):
                 smooth_score(
                     name,
                     structure.unflatten([*leaves[:place], leaf + step * direction, *leaves[place + 1 :]]),
-                    cache,
+                    kept,
                     RULES["own"],
                 )
                 for step in (STEP, -STEP)
@@ -189,8 +197,8 @@ def test_no_step_however_long_makes_an_illegal_or_infinite_number(name, scale, s
     rng = np.random.default_rng(seed)
     start = to_free(TunedParams(FUSION, numbers_of(recipe)), tunable_labels(recipe.labeller, recipe.rule).limits)
     free = jax.tree.map(lambda leaf: jnp.asarray(leaf + scale * rng.normal(size=leaf.shape), jnp.float32), start)
-    assert np.isfinite(smooth_score(name, free, CACHES[name], RULES["own"]))
-    for leaf in jax.tree.leaves(slope_of(name, free, CACHES[name], RULES["own"])):
+    assert np.isfinite(smooth_score(name, free, cache_of(name), RULES["own"]))
+    for leaf in jax.tree.leaves(slope_of(name, free, cache_of(name), RULES["own"])):
         assert np.isfinite(leaf).all()
 
 
