@@ -127,7 +127,9 @@ def search_plane(
     residuals_m = normals @ sample.T + offsets[:, None]
     costs = jnp.where(acceptable, jax.vmap(score)(residuals_m), jnp.inf)
     best = jnp.argmin(costs)
-    return PlaneStart(sample, centre, normals[best], offsets[best], acceptable[best] & enough)
+    # Which hypothesis wins is a choice, and those through one point twice have no gradient: the refit has.
+    normal, offset = jax.lax.stop_gradient((normals[best], offsets[best]))
+    return PlaneStart(sample, centre, normal, offset, acceptable[best] & enough)
 
 
 def refit_plane(
@@ -141,7 +143,10 @@ def refit_plane(
 ) -> Plane:
     """The second half of `fit_plane_mlesac`, differentiable in `sigma_m`: least squares on inlier posteriors."""
     mixture = (sigma_m, outlier_range_m, em_rounds)
-    normal, offset, inliers = _refit(start.sample, start.normal, start.offset_m, up_hint, mixture)
+    # Points all alike, as where nothing is valid, have a spread without directions: its eigenvectors have no gradient.
+    sample = jnp.where(start.found, start.sample, _spread_points(start.sample.shape[0]))
+    first = jnp.where(start.found, start.normal, up_hint)
+    normal, offset, inliers = _refit(sample, first, jnp.where(start.found, start.offset_m, 0.0), up_hint, mixture)
     # Points of a wall may turn the refitted plane over; the hypothesis is acceptable as it is.
     upright = normal @ up_hint >= jnp.cos(max_tilt_rad)
     normal = jnp.where(upright, normal, start.normal)
@@ -152,6 +157,13 @@ def refit_plane(
         inlier_fraction=jnp.where(start.found, inliers, 0.0),
         found=start.found,
     )
+
+
+def _spread_points(count: int) -> Float[Array, "S 3"]:
+    """Millimetres to either side of the origin along the axes, along each another distance."""
+    place = jnp.arange(count)
+    distance_m = jnp.array([3e-3, 2e-3, 1e-3])[place % 3] * jnp.where(place // 3 % 2, 1.0, -1.0)
+    return jnp.where(place[:, None] % 3 == jnp.arange(3), distance_m[:, None], 0.0)
 
 
 def plane_distance(plane: Plane, points: Float[Array, "*s 3"]) -> Float[Array, "*s"]:
