@@ -12,7 +12,7 @@ from jaxmap.commands import COMMANDS
 from jaxmap.errors import JaxmapError
 from jaxmap.host_memory import restart_with_lasting_memory
 
-LASTING_MEMORY = ("train", "segment", "map", "demo")
+LASTING_MEMORY = ("train", "tune", "segment", "map", "demo")
 """Commands that take and give back the memory of a network at every step: gigabytes in training, hundreds of MiB where
 images are labelled, a sixth of whose time it took to fetch them anew."""
 

@@ -96,6 +96,9 @@ class FusionConfig:
     """A voxel is occupied above this probability."""
     class_threshold: Probability = 0.5
     """A priority class wins above this probability."""
+    class_kernel: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    """One odd square a class: how much of the evidence of neighbouring columns counts when the map is read; tune
+    --kernel learns it."""
 
 
 DEFAULT_PRIORITY = ("rock",)
@@ -113,6 +116,8 @@ class PlaneConfig:
 
     threshold_m: Positive = 0.1
     """Points farther from the plane are rock."""
+    softness_m: Annotated[float, Ge(0)] = 0.0
+    """Width of the passage from sand to rock around the threshold; at 0 it is sharp."""
     max_height_m: Positive = 2.0
     """Points farther still are left out."""
     on_plane: str = "sand"

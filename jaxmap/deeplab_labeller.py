@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxmap.errors import JaxmapError
-from jaxmap.labellers import Labeller
+from jaxmap.labellers import Cues, Labeller, TunableLabels, fixed_labels
 from jaxmap.labels import IGNORE
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import Weights, fold_batch_norm, pure_network
-from jaxmap.models.pixelwise import Size, check_size, map_pixels, resized_input, upsampling
+from jaxmap.models.pixelwise import Size, Upsampling, check_size, map_pixels, resized_input, upsampling
 from jaxmap.models.tensor_files import shortened
 from jaxmap.types import Frame, PointLabels
 
@@ -123,12 +123,15 @@ def make_deeplab_labeller(
         for wanted in range(len(mapped.classes))
     ]
 
-    def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:
+    def see(frame: Frame, params: Any) -> tuple[Array, Upsampling]:
         image = _image(frame)
         coarse = network.apply_coarse(params.weights, resized_input(image[None], size_px))[0]
+        return coarse, upsampling(network.architecture, coarse.shape[:2], image.shape[:2], size_px)
+
+    def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:
+        coarse, places = see(frame, params)
         coarse = coarse * jnp.exp(-params.log_temperature)
         with jax.named_scope("pixel_labels"):
-            places = upsampling(network.architecture, coarse.shape[:2], image.shape[:2], size_px)
             if soft:
                 shares = map_pixels(lambda logits: _merged_softmax(logits, groups), coarse, places)
                 # They are never stored side by side: each scatter reads its own one.
@@ -137,8 +140,19 @@ def make_deeplab_labeller(
             (labels,) = map_pixels(lambda logits: (_likeliest(logits, mapped.targets),), coarse, places)
             return PointLabels(keep=valid, labels=labels.reshape(-1)), None
 
+    def cues(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> Cues:
+        count = len(saved.architecture.classes)
+        logits = map_pixels(lambda rows: tuple(rows[:, index] for index in range(count)), *see(frame, params))
+        return Cues(valid, jnp.stack([one.reshape(-1) for one in logits], axis=-1))
+
+    def probabilities(values: Array, frame: Array, shared: Any, numbers: dict[str, Array]) -> Array:
+        every = jax.nn.softmax(values / numbers["temperature"], axis=-1)
+        return jnp.stack([every[:, jnp.array(group)].sum(axis=-1) for group in groups], axis=-1)
+
     params = DeeplabParams(network.weights, jnp.asarray(np.log(temperature), jnp.float32))
-    return Labeller("deeplab", mapped.classes, "image", label, params)
+    soft_labels = TunableLabels({"temperature": temperature}, {"temperature": (0.02, 50.0)}, cues, probabilities)
+    tunable = soft_labels if soft else fixed_labels(label)
+    return Labeller("deeplab", mapped.classes, "image", label, params, tunable)
 
 
 def _image(frame: Frame) -> UInt8[Array, "H W 3"]:

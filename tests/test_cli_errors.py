@@ -19,6 +19,7 @@ from faults import MAP_FAULTS, nan_pose, truncated
 from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from network_faults import IMPORT_FAULTS, SEGMENT_FAULTS, segment_words, write_inputs
 from training_data import CLASSES, TRAIN_FAULTS, write_data
+from tune_faults import TUNE_FAULTS
 
 import jaxmap
 
@@ -129,6 +130,20 @@ def test_a_batch_that_the_devices_cannot_share_is_one_line(tmp_path, cli, told, 
     outcome = cli("train", data, "--out", tmp_path / "run", "--classes", *CLASSES, "--batch-size", "8")
     assert outcome.status == 2
     compare("train: batch not shared by the devices", f"{outcome.status} {outcome.error}", tmp_path, told)
+
+
+@pytest.mark.parametrize("name", TUNE_FAULTS)
+def test_a_fault_of_tune_is_one_line(name, scene_folder, tmp_path, cli, told):
+    expected, damage = TUNE_FAULTS[name]
+    words = damage(scene_folder, tmp_path)
+    before = files_of(tmp_path)
+    outcome = cli(*words)
+    assert outcome.status == expected, outcome
+    assert "fault of jaxmap" not in outcome.error
+    assert len(outcome.error) < 400
+    assert ";" in outcome.error, "says what to do"
+    assert files_of(tmp_path) == before
+    compare(name, f"{outcome.status} {outcome.error}".replace(str(scene_folder), "<scene>"), tmp_path, told)
 
 
 def faulty_command(name: str, tmp_path: Path, finished: Path) -> tuple[int, list[str]]:

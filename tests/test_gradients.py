@@ -141,11 +141,18 @@ def test_the_view_from_above_passes_finite_gradients(column, scale):
         assert np.abs(gradient[0]).max() > 0
 
 
-def test_no_gradient_is_nan_with_the_plane_labeller():
-    labeller = make_plane_labeller(CLASSES, hypotheses=32, sample_points=256)
-    mapper = make_mapper(CAMERA, GRID, labeller, FusionRule(), (0.3, 4.0))
+@pytest.mark.parametrize("softness_m", [0.0, 0.1])
+def test_no_gradient_is_nan_with_the_plane_labeller(softness_m):
+    labeller = make_plane_labeller(CLASSES, hypotheses=32, sample_points=256, softness_m=softness_m)
+    mapper, params = (
+        make_mapper(CAMERA, GRID, labeller, FusionRule(), (0.3, 4.0)),
+        replace(PARAMS, labeller=labeller.params),
+    )
     seen = replace(an_example_frame(), class_probabilities=None)
     blind = replace(seen, disparity_px=jnp.full_like(seen.disparity_px, jnp.nan))
     for frame in (seen, blind):
-        gradient = gradient_of(mapper, PARAMS, mapper.init(), frame)
+        gradient = gradient_of(mapper, params, mapper.init(), frame)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        # A sharp threshold passes no gradient; a soft one does.
+        moved = [bool(np.asarray(leaf).any()) for leaf in gradient.labeller[1:]]
+        assert moved == [softness_m > 0 and frame is seen] * 2

@@ -17,7 +17,8 @@ from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, PointLabels
 
 PIXELS = HEIGHT_PX * WIDTH_PX
-PLANE = make_plane_labeller(CLASSES, threshold_m=0.1, max_height_m=1.0, hypotheses=64, sample_points=512, sigma_m=0.02)
+FIT = dict(threshold_m=0.1, max_height_m=1.0, hypotheses=64, sample_points=512, sigma_m=0.02)
+PLANE, SOFT_PLANE = make_plane_labeller(CLASSES, **FIT), make_plane_labeller(CLASSES, softness_m=0.01, **FIT)
 HARD = make_files_labeller(CLASSES, soft=False)
 SOFT = make_files_labeller(CLASSES, soft=True)
 
@@ -26,9 +27,16 @@ def frame_of(**fields) -> Frame:
     return Frame(jnp.zeros((HEIGHT_PX, WIDTH_PX)), jaxlie.SE3.identity(), **fields)
 
 
-@partial(jax.jit, static_argnums=0)
+ALL = np.ones(PIXELS, bool)
+
+
 def label_with(labeller: Labeller, frame, points, valid, key):
-    return labeller.label(frame, points, valid, labeller.params, key)
+    return labelled(labeller.label, frame, points, valid, labeller.params, key)
+
+
+@partial(jax.jit, static_argnums=0)
+def labelled(label, *inputs):
+    return label(*inputs)
 
 
 def beach(rng: np.random.Generator) -> np.ndarray:
@@ -58,6 +66,19 @@ def test_the_beach_is_sand_and_what_stands_out_is_rock(rng):
     assert np.all(np.asarray(labels.labels)[low] == 1)
     assert np.all(np.asarray(labels.labels)[~low] == 2)
     np.testing.assert_array_equal(labels.keep, ~high)
+
+
+@given(rngs())
+def test_a_soft_threshold_goes_to_the_sharp_one(rng):
+    points, key = beach(rng), jax.random.key(1)
+    soft, plane = label_with(SOFT_PLANE, frame_of(), points, ALL, key)
+    sharp, _ = label_with(PLANE, frame_of(), points, ALL, key)
+    off = np.abs(points @ reference.f64(plane.normal) + float(plane.offset_m))
+    rock = 1 / (1 + np.exp(-(off - 0.1) / 0.01))
+    np.testing.assert_allclose(soft.probabilities, np.stack([0 * rock, 1 - rock, rock], -1), atol=1e-3)
+    clear = np.abs(off - 0.1) > 1e-3
+    np.testing.assert_array_equal(np.asarray(soft.probabilities).argmax(-1)[clear], np.asarray(sharp.labels)[clear])
+    np.testing.assert_array_equal(soft.keep, sharp.keep)
 
 
 def test_without_a_plane_points_are_kept_without_a_class():
@@ -122,6 +143,7 @@ def test_every_labeller_gives_exactly_one_kind_of_label(labeller):
         (dict(threshold_m=0.0), "threshold_m 0.0 and max_height_m 2.0 in plane labeller; take 0 < threshold_m"),
         (dict(threshold_m=3.0), "take 0 < threshold_m < max_height_m"),
         (dict(threshold_m=float("nan")), "take 0 < threshold_m < max_height_m"),
+        (dict(softness_m=-0.1), "softness_m -0.1 in plane labeller; give a width"),
     ],
 )
 def test_a_wrong_plane_labeller_is_refused_in_one_line(options, says):

@@ -27,6 +27,8 @@ WIDE_GRID = make_grid([-40, -40, -2], [40, 40, 3], 0.25)
 DEPTH_RANGE_M = (0.3, 4.0)
 KEY = jax.random.key(7)
 PARAMS = MapperParams(CAMERA, make_fusion_params(CLASSES))
+PLANE = make_plane_labeller(CLASSES, hypotheses=32, sample_points=256)
+PLANE_PARAMS = replace(PARAMS, labeller=PLANE.params)
 RULES = {
     "own": FusionRule(),
     "sum": FusionRule("sum"),
@@ -45,8 +47,7 @@ def mappers() -> dict[str, Mapper]:
 
 @pytest.fixture(scope="session")
 def plane_mapper() -> Mapper:
-    labeller = make_plane_labeller(CLASSES, hypotheses=32, sample_points=256)
-    return make_mapper(CAMERA, GRID, labeller, FusionRule(), DEPTH_RANGE_M)
+    return make_mapper(CAMERA, GRID, PLANE, FusionRule(), DEPTH_RANGE_M)
 
 
 @pytest.fixture(scope="session")
@@ -153,10 +154,10 @@ def test_a_scan_equals_a_loop_of_steps(plane_mapper):
     sequence = [unlabelled(an_example_frame(seed)) for seed in range(3)]
     looped, infos = plane_mapper.init(), []
     for frame in sequence:
-        looped, info = plane_mapper.step(looped, frame, PARAMS, KEY)
+        looped, info = plane_mapper.step(looped, frame, PLANE_PARAMS, KEY)
         infos.append(info)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sequence)
-    scanned, scanned_info = plane_mapper.scan(plane_mapper.init(), stacked, PARAMS, KEY)
+    scanned, scanned_info = plane_mapper.scan(plane_mapper.init(), stacked, PLANE_PARAMS, KEY)
     assert_maps_equal(scanned, looped, atol=1e-5)
     for field in ("points_valid", "points_kept", "voxels_hit", "voxels_freed"):
         np.testing.assert_array_equal(getattr(scanned_info, field), [getattr(one, field) for one in infos])
@@ -178,7 +179,7 @@ def test_the_same_key_gives_the_same_map_bit_for_bit(plane_mapper, sequence):
     for _ in range(2):
         voxel_map = plane_mapper.init()
         for frame in sequence:
-            voxel_map, _ = plane_mapper.step(voxel_map, unlabelled(frame), PARAMS, KEY)
+            voxel_map, _ = plane_mapper.step(voxel_map, unlabelled(frame), PLANE_PARAMS, KEY)
         maps.append(voxel_map)
     assert_maps_equal(*maps)
 
@@ -187,7 +188,7 @@ def test_each_frame_of_a_run_draws_its_own_hypotheses(plane_mapper):
     frame, planes = unlabelled(an_example_frame(0)), []
     voxel_map = plane_mapper.init()
     for _ in range(2):
-        voxel_map, info = plane_mapper.step(voxel_map, frame, PARAMS, KEY)
+        voxel_map, info = plane_mapper.step(voxel_map, frame, PLANE_PARAMS, KEY)
         planes.append(np.asarray(info.plane.normal))
     assert not np.array_equal(*planes)
 

@@ -8,6 +8,7 @@ COMMANDS: dict[str, str] = {
     "train": "train or fine-tune DeepLabv3+ on images and masks",
     "refine": "refine poses, camera mounting and stereo calibration until frames agree",
     "evaluate": "score a map against an orthomosaic labelled from above",
+    "tune": "tune the numbers of fusion against ground truth",
     "segment": "label images with a network, and score the labels",
     "simulate": "render a traverse, or training images, of a simulated world",
     "weights": "convert or download pretrained networks",

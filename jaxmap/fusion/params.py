@@ -22,6 +22,8 @@ class FusionParams:
 
     Log-odds are natural. `class_increments[i, j]` is what one observation of label `i` adds to
     class `j`. `disparity_sigma_px` drives the range weight and the margin of free-space carving.
+    `class_kernel`, one odd square a class, spreads evidence over neighbouring columns when the map is
+    read (`neighbours`); None for not at all.
     """
 
     occupancy_hit: Float[Array, ""]
@@ -33,6 +35,7 @@ class FusionParams:
     full_evidence_points: Float[Array, ""]
     occupancy_threshold: Float[Array, ""]
     class_threshold: Float[Array, ""]
+    class_kernel: Float[Array, "C K K"] | None = None
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,7 @@ def make_fusion_params(
     full_evidence_points: float = 8.0,
     occupancy_threshold: float = 0.5,
     class_threshold: float = 0.5,
+    class_kernel: ArrayLike | None = None,
 ) -> FusionParams:
     """Checks and builds `FusionParams`; priors and thresholds are probabilities here.
 
@@ -149,6 +153,7 @@ def make_fusion_params(
         full_evidence_points=leaf(full_evidence_points),
         occupancy_threshold=leaf(occupancy_threshold),
         class_threshold=leaf(class_threshold),
+        class_kernel=None if class_kernel is None else leaf(_kernels(count, class_kernel)),
     )
 
 
@@ -192,3 +197,19 @@ def _increment_matrix(
             fix="give one row per observed label and one column per class",
         )
     return matrix
+
+
+def _kernels(count: int, class_kernel: ArrayLike) -> np.ndarray:
+    """One square of odd size for each class, float64 (count, K, K)."""
+    try:
+        kernels = np.asarray(class_kernel, np.float64)
+    except ValueError:
+        kernels = np.zeros((0, 0, 0))
+    odd = kernels.ndim == 3 and len({*kernels.shape[1:]}) == 1 and kernels.shape[-1] % 2 == 1
+    if not odd or len(kernels) != count or not np.isfinite(kernels).all():
+        raise JaxmapError(
+            f"class_kernel is not {count} finite squares of one odd size",
+            where="fusion",
+            fix="give one kernel for each class, such as 3x3",
+        )
+    return kernels

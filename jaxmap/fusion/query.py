@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
+from jaxmap.fusion.neighbours import spread_evidence
 from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.geometry.grid import voxel_centres
 from jaxmap.labels import IGNORE
@@ -54,10 +55,14 @@ def voxel_labels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) ->
     """One label per voxel: a class index, or `IGNORE` where it is free, unknown or without class.
 
     The priority classes win in their order as soon as their probability passes the threshold (the
-    paper: a cell is rock when p > 0.70); otherwise the likeliest of the others that has evidence.
+    paper: a cell is rock when p > 0.70); otherwise the likeliest of the others that has evidence. Evidence is that of
+    the voxel, and through `class_kernel` that of occupied neighbours at its height.
     """
-    log_odds = voxel_map.log_odds[1:] + params.class_prior[:, None, None, None]
-    return _decide(log_odds, occupied(voxel_map, params), params, rule, voxel_map.classes)
+    solid, evidence = occupied(voxel_map, params), voxel_map.log_odds[1:]
+    if params.class_kernel is not None:
+        evidence = spread_evidence(jnp.where(solid, evidence, 0.0), params.class_kernel)
+    log_odds = evidence + params.class_prior[:, None, None, None]
+    return _decide(log_odds, solid, params, rule, voxel_map.classes)
 
 
 @partial(jax.jit, static_argnames="rule")
@@ -65,7 +70,8 @@ def top_down(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> Top
     """The map seen from above.
 
     The class evidence of a column is the sum over its occupied voxels, or the greatest of them
-    (`rule.column`); labels follow the rule of `voxel_labels`.
+    (`rule.column`), spread over neighbouring columns where there is a `class_kernel`; labels follow the rule of
+    `voxel_labels`.
     """
     solid = occupied(voxel_map, params)
     evidence = voxel_map.log_odds[1:]
@@ -74,7 +80,10 @@ def top_down(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> Top
     else:
         column = jnp.where(solid, evidence, -jnp.inf).max(axis=-1)
     seen = solid.any(axis=-1)
-    log_odds = jnp.where(seen, column, 0.0) + params.class_prior[:, None, None]
+    column = jnp.where(seen, column, 0.0)
+    if params.class_kernel is not None:
+        column = jnp.where(seen, spread_evidence(column, params.class_kernel), 0.0)
+    log_odds = column + params.class_prior[:, None, None]
     heights_m = jnp.where(solid, voxel_centres(voxel_map.grid)[..., 2], -jnp.inf).max(axis=-1)
     return TopDown(
         probability=jax.nn.sigmoid(log_odds),

@@ -6,7 +6,7 @@ Computer Vision and Image Understanding 78 (2000), 138-156.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,39 +59,111 @@ def fit_plane_mlesac(
         one through the origin across `up_hint`.
     """
     with jax.named_scope("mlesac"):
-        draw_key, triple_key = jax.random.split(key)
-        sample, enough = _draw_valid(draw_key, points, valid, sample_points)
-        # Centred: the moments of the refit lose no digits, however far the frame's origin is.
-        centre = sample.mean(axis=0)
-        sample = sample - centre
-        triples = jax.random.randint(triple_key, (hypotheses, 3), 0, sample_points)
-        normals, offsets, proper = _planes_through(sample[triples], up_hint)
-        acceptable = proper & (normals @ up_hint >= jnp.cos(max_tilt_rad))
-
-        def score(residuals: Array) -> Array:
-            if cost == "msac":
-                return jnp.minimum(residuals**2, (1.96 * sigma_m) ** 2).sum()
-            # Computed once: the rounds of EM only weigh it anew.
-            density = jax.lax.optimization_barrier(_inlier_density(residuals, sigma_m))
-            gamma = _mixing(density, outlier_range_m, em_rounds)
-            return -jnp.log(gamma * density + (1.0 - gamma) / outlier_range_m).sum()
-
-        residuals_m = normals @ sample.T + offsets[:, None]
-        costs = jnp.where(acceptable, jax.vmap(score)(residuals_m), jnp.inf)
-        best = jnp.argmin(costs)
-        found = acceptable[best] & enough
-        mixture = (sigma_m, outlier_range_m, em_rounds)
-        normal, offset, inliers = _refit(sample, normals[best], offsets[best], up_hint, mixture)
-        # Points of a wall may turn the refitted plane over; the hypothesis is acceptable as it is.
-        upright = normal @ up_hint >= jnp.cos(max_tilt_rad)
-        normal = jnp.where(upright, normal, normals[best])
-        offset = jnp.where(upright, offset, offsets[best])
-        return Plane(
-            normal=jnp.where(found, normal, up_hint),
-            offset_m=jnp.where(found, offset - normal @ centre, 0.0),
-            inlier_fraction=jnp.where(found, inliers, 0.0),
-            found=found,
+        start = search_plane(
+            key,
+            points,
+            valid,
+            up_hint=up_hint,
+            sigma_m=sigma_m,
+            outlier_range_m=outlier_range_m,
+            max_tilt_rad=max_tilt_rad,
+            hypotheses=hypotheses,
+            sample_points=sample_points,
+            em_rounds=em_rounds,
+            cost=cost,
         )
+        return refit_plane(
+            start,
+            up_hint=up_hint,
+            sigma_m=sigma_m,
+            outlier_range_m=outlier_range_m,
+            max_tilt_rad=max_tilt_rad,
+            em_rounds=em_rounds,
+        )
+
+
+class PlaneStart(NamedTuple):
+    """The best hypothesis and the points that judged it, relative to their `centre_m`."""
+
+    sample: Float[Array, "S 3"]
+    centre_m: Float[Array, "3"]
+    normal: Float[Array, "3"]
+    offset_m: Float[Array, ""]
+    found: Bool[Array, ""]
+
+
+def search_plane(
+    key: PRNGKeyArray,
+    points: Float[Array, "N 3"],
+    valid: Bool[Array, "N"],
+    *,
+    up_hint: Float[Array, "3"],
+    sigma_m: Float[Array, ""] | float,
+    outlier_range_m: Float[Array, ""] | float,
+    max_tilt_rad: float,
+    hypotheses: int,
+    sample_points: int,
+    em_rounds: int,
+    cost: Literal["mlesac", "msac"],
+) -> PlaneStart:
+    """The first half of `fit_plane_mlesac`, whose arguments it takes: the hypothesis that wins, not yet refitted."""
+    draw_key, triple_key = jax.random.split(key)
+    sample, enough = _draw_valid(draw_key, points, valid, sample_points)
+    # Centred: the moments of the refit lose no digits, however far the frame's origin is.
+    centre = sample.mean(axis=0)
+    sample = sample - centre
+    triples = jax.random.randint(triple_key, (hypotheses, 3), 0, sample_points)
+    normals, offsets, proper = _planes_through(sample[triples], up_hint)
+    acceptable = proper & (normals @ up_hint >= jnp.cos(max_tilt_rad))
+
+    def score(residuals: Array) -> Array:
+        if cost == "msac":
+            return jnp.minimum(residuals**2, (1.96 * sigma_m) ** 2).sum()
+        # Computed once: the rounds of EM only weigh it anew.
+        density = jax.lax.optimization_barrier(_inlier_density(residuals, sigma_m))
+        gamma = _mixing(density, outlier_range_m, em_rounds)
+        return -jnp.log(gamma * density + (1.0 - gamma) / outlier_range_m).sum()
+
+    residuals_m = normals @ sample.T + offsets[:, None]
+    costs = jnp.where(acceptable, jax.vmap(score)(residuals_m), jnp.inf)
+    best = jnp.argmin(costs)
+    # Which hypothesis wins is a choice, and those through one point twice have no gradient: the refit has.
+    normal, offset = jax.lax.stop_gradient((normals[best], offsets[best]))
+    return PlaneStart(sample, centre, normal, offset, acceptable[best] & enough)
+
+
+def refit_plane(
+    start: PlaneStart,
+    *,
+    up_hint: Float[Array, "3"],
+    sigma_m: Float[Array, ""] | float,
+    outlier_range_m: Float[Array, ""] | float,
+    max_tilt_rad: float,
+    em_rounds: int,
+) -> Plane:
+    """The second half of `fit_plane_mlesac`, differentiable in `sigma_m`: least squares on inlier posteriors."""
+    mixture = (sigma_m, outlier_range_m, em_rounds)
+    # Points all alike, as where nothing is valid, have a spread without directions: its eigenvectors have no gradient.
+    sample = jnp.where(start.found, start.sample, _spread_points(start.sample.shape[0]))
+    first = jnp.where(start.found, start.normal, up_hint)
+    normal, offset, inliers = _refit(sample, first, jnp.where(start.found, start.offset_m, 0.0), up_hint, mixture)
+    # Points of a wall may turn the refitted plane over; the hypothesis is acceptable as it is.
+    upright = normal @ up_hint >= jnp.cos(max_tilt_rad)
+    normal = jnp.where(upright, normal, start.normal)
+    offset = jnp.where(upright, offset, start.offset_m)
+    return Plane(
+        normal=jnp.where(start.found, normal, up_hint),
+        offset_m=jnp.where(start.found, offset - normal @ start.centre_m, 0.0),
+        inlier_fraction=jnp.where(start.found, inliers, 0.0),
+        found=start.found,
+    )
+
+
+def _spread_points(count: int) -> Float[Array, "S 3"]:
+    """Millimetres to either side of the origin along the axes, along each another distance."""
+    place = jnp.arange(count)
+    distance_m = jnp.array([3e-3, 2e-3, 1e-3])[place % 3] * jnp.where(place // 3 % 2, 1.0, -1.0)
+    return jnp.where(place[:, None] % 3 == jnp.arange(3), distance_m[:, None], 0.0)
 
 
 def plane_distance(plane: Plane, points: Float[Array, "*s 3"]) -> Float[Array, "*s"]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmap.fusion.neighbours import spread_evidence
 from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.types import VoxelMap
 
@@ -104,6 +105,8 @@ def soft_columns(
             weighed = evidence + jax.nn.log_sigmoid(margin)
             column = columns.greatest(jnp.where(observed, weighed, _FAR_BELOW))
             column = jnp.where(column > 0.5 * _FAR_BELOW, column, 0.0)
+        if params.class_kernel is not None:
+            column = spread_evidence(column[None], params.class_kernel[index][None])[0]
         return column + params.class_prior[index]
 
     own = read(target)

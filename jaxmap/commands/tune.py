@@ -1,0 +1,180 @@
+"""`jaxmap tune`: tunes the numbers of fusion against labelled orthomosaics."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxmap.commands.console import Console, parse
+from jaxmap.config import MapConfig, check_config, config_tree, load_config
+from jaxmap.errors import UsageError
+
+
+@dataclass(frozen=True)
+class TuneArguments:
+    """Tune the numbers of fusion by gradient descent, on traverses whose ground truth is known.
+
+    Maps the frames once, then moves increments, priors, thresholds, range weighting and the labeller's own numbers
+    to where the map agrees best with the ground truth. Part of the ground is held out and decides when to stop.
+    Writes OUT, a configuration for jaxmap map --config, at every step that is the best so far; and beside it
+    OUT's .json (scores before and after, with intervals) and .html (the same with plots).
+    """
+
+    sequence: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of sequences, or sample:NAME."""
+    ground_truth: tuple[Path, ...]
+    """A labelled orthomosaic for each sequence, in the same order (GeoTIFF: 0 unlabelled, 1 sand, 2 rock)."""
+    out: Path
+    """The YAML file to write."""
+    config: str | None = None
+    """YAML file, or the name of a bundled one, to start from; options given here go before it."""
+    labels_of: tuple[Path, ...] = ()
+    """Folders of labels, one for each sequence, where there are several (--labels for one)."""
+    poses_of: tuple[Path, ...] = ()
+    """Pose files, one for each sequence, where there are several (--poses for one)."""
+    target: Annotated[str, tyro.conf.arg(name="class")] = "rock"
+    """The class that is scored."""
+    steps: int = 150
+    """Steps of descent, at most."""
+    learning_rate: float = 0.05
+    """Of the descent; the least, if the loss diverges."""
+    patience: int = 40
+    """Stop after so many steps without a better held-out loss."""
+    class_weight: float = 1.0
+    """Weight of rock cells in the likelihood. Above 1 more rocks are found, and probabilities come out too high."""
+    iou_weight: float = 1.0
+    """Weight of 1 - soft IoU, beside the negative log-likelihood."""
+    held_out_share: float = 0.25
+    """Share of the ground that is held out, in blocks of 2 m and whole rocks."""
+    kernel: int = 0
+    """Learn a kernel of so many columns a side (3, 5, 7, 9) for each class in a second descent, and write it too."""
+    frozen: tuple[str, ...] = ()
+    """Names of parameters that stay as they are, such as disparity_sigma_px."""
+    cell_size_m: float = 0.2
+    """Edge of the cells that are scored."""
+    rock_fraction: float = 0.5
+    """A cell is rock where rock covers this share of it."""
+    remap: tuple[str, ...] = ()
+    """What the values of the orthomosaics mean: 0=unlabelled 7=rock '*=sand', or colours: '#b23c2e=rock'."""
+    palette: Path | None = None
+    """The same as a YAML file of CODE: CLASS."""
+    truth_crs: str | None = None
+    """Coordinate reference system of the ground truth, in place of its own."""
+    overwrite: bool = False
+    """Replace the files of an earlier run."""
+    settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    arguments = parse(TuneArguments, "tune", words, with_config=_with_config)
+    config = check_config(config_tree(arguments.settings))
+    _check(arguments, config)
+
+    from jaxmap.cache import keep_compiled_programs
+    from jaxmap.datasets.label_coding import DEFAULT_CODING, parse_coding, read_coding
+    from jaxmap.map_evaluation import TruthOptions
+    from jaxmap.tuning.descent import DescentOptions
+    from jaxmap.tuning.map_loss import LossOptions
+    from jaxmap.tuning_run import Source, TuneOptions, TuningRun
+
+    keep_compiled_programs()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    console = Console()
+    coding = DEFAULT_CODING
+    if arguments.remap:
+        coding = parse_coding(arguments.remap)
+    elif arguments.palette is not None:
+        coding = read_coding(arguments.palette)
+    count = len(arguments.sequence)
+    rows = zip(
+        arguments.sequence,
+        arguments.ground_truth,
+        arguments.labels_of or (None,) * count,
+        arguments.poses_of or (None,) * count,
+        strict=True,
+    )
+    options = TuneOptions(
+        DescentOptions(arguments.steps, arguments.learning_rate, arguments.patience),
+        LossOptions(1.0, arguments.iou_weight, arguments.class_weight, arguments.rock_fraction),
+        arguments.frozen,
+        arguments.cell_size_m,
+        arguments.held_out_share,
+        seed=config.seed,
+        kernel=arguments.kernel,
+    )
+    run = TuningRun(
+        [Source(*row) for row in rows],
+        config,
+        TruthOptions(arguments.target, coding, arguments.truth_crs),
+        options,
+        arguments.out,
+        tell=console.tell,
+    )
+    with console.steps("reading", "frames", run.frames) as advance:
+        run.cache(advance)
+    with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
+        result = run.tune(advance)
+    _print(console, result)
+    out = arguments.out
+    console.result(out.parent, [out.name, out.with_suffix(".json").name, out.with_suffix(".html").name])
+    return 0
+
+
+def _check(arguments: TuneArguments, config: MapConfig) -> None:
+    count = len(arguments.sequence)
+    if not count:
+        raise UsageError("no sequence", where="the command line", fix="name the folder of one")
+    for name in ("ground_truth", "labels_of", "poses_of"):
+        given = len(getattr(arguments, name))
+        if given != count and (given or name == "ground_truth"):
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{count} sequences and {given} of {option}", fix="give one for each, in the same order")
+    for single, several in (("labels", "labels_of"), ("poses", "poses_of")):
+        if count > 1 and getattr(config, single) is not None:
+            raise UsageError(
+                f"--{single} is of one sequence, and there are {count}",
+                fix=f"give --{several.replace('_', '-')}, one for each",
+            )
+    if arguments.out.suffix.lower() not in (".yaml", ".yml"):
+        raise UsageError(f"--out {arguments.out} is not a .yaml file", fix="name a YAML file")
+    if arguments.remap and arguments.palette is not None:
+        raise UsageError("--remap and --palette exclude each other", fix="give one of them")
+    there = [path for suffix in ("", ".json", ".html") if (path := _beside(arguments.out, suffix)).exists()]
+    if there and not arguments.overwrite:
+        raise UsageError("there already", where=there[0], fix="choose another --out, or add --overwrite")
+
+
+def _beside(out: Path, suffix: str) -> Path:
+    return out.with_suffix(suffix) if suffix else out
+
+
+def _print(console: Console, result: dict) -> None:
+    columns = {"score": "held-out ground", "before": "before", "after": "after", "change": "change (90 % interval)"}
+    for stage in result["stages"]:
+        rows = [
+            {
+                "score": name,
+                "before": _text(row["before"]),
+                "after": _text(row["after"]),
+                "change": f"{_text(row['change'])} ({' to '.join(map(_text, row['change_interval'] or (None, None)))})",
+            }
+            for name, row in stage["scores"]["held_out"].items()
+        ]
+        console.table(f"{result['class']}, {stage['name']}, best after {stage['best_step']} steps", columns, rows)
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _with_config(name: str) -> TuneArguments:
+    """The defaults under a configuration; the required arguments are filled in by the parser."""
+    return TuneArguments(
+        sequence=tyro.MISSING, ground_truth=tyro.MISSING, out=tyro.MISSING, config=name, settings=load_config(name)
+    )

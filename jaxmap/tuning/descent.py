@@ -1,0 +1,118 @@
+"""Gradient descent with a held-out loss: the best parameters are kept at every step, and it stops when they stay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import PyTree
+
+from jaxmap.errors import JaxmapError, UsageError
+
+
+@dataclass(frozen=True)
+class DescentOptions:
+    """How the descent goes.
+
+    Attributes:
+        steps: at most.
+        learning_rate: of Adam, in units of the free numbers; it falls to zero along a half cosine.
+        patience: steps without a better held-out loss after which it stops.
+        max_norm: gradients are shortened to this length.
+    """
+
+    steps: int = 150
+    learning_rate: float = 0.05
+    patience: int = 40
+    max_norm: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuses what makes no sense."""
+        for name in ("steps", "patience"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"{name} is {getattr(self, name)}", where="tuning", fix="give a number above 0")
+        for name in ("learning_rate", "max_norm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise UsageError(f"{name} is {getattr(self, name)}", where="tuning", fix="give a number above 0")
+
+
+class Losses(NamedTuple):
+    """The loss of the ground that is tuned on, and of what is held out."""
+
+    tuned: float
+    held_out: float
+
+
+class Step(NamedTuple):
+    """Where the descent stands: the step, its losses, the parameters, and whether they are the best so far."""
+
+    number: int
+    losses: Losses
+    free: PyTree
+    best: bool
+
+
+def descend(
+    loss: Callable[..., tuple[jax.Array, jax.Array]],
+    start: PyTree,
+    options: DescentOptions,
+    *,
+    data: tuple[PyTree, ...] = (),
+    moves: PyTree | None = None,
+    on_step: Callable[[Step], None] = lambda step: None,
+) -> Step:
+    """Descends from `start`, and returns the step of the least held-out loss; the first one is the start itself.
+
+    Args:
+        loss: `(free, *data)` to the loss that is descended and the held-out one; differentiable in the free numbers.
+        start: free numbers.
+        options: see there.
+        data: what the loss is of, handed to it at every step: closed over, it would be compiled in as constants.
+        moves: a tree like `start` of 1 for numbers that move and 0 for those that stay; all move by default.
+        on_step: is called at every step.
+
+    Raises:
+        JaxmapError: a loss or a gradient is not finite, or the loss has grown a hundredfold; the steps before were
+            handed to `on_step`.
+    """
+    schedule = optax.cosine_decay_schedule(options.learning_rate, options.steps)
+    optimiser = optax.chain(optax.clip_by_global_norm(options.max_norm), optax.adam(schedule))
+
+    @jax.jit
+    def advance(free: PyTree, state: PyTree, data: tuple) -> tuple[PyTree, PyTree, tuple[jax.Array, ...]]:
+        (tuned, held_out), gradient = jax.value_and_grad(loss, has_aux=True)(free, *data)
+        if moves is not None:
+            gradient = jax.tree.map(jnp.multiply, gradient, moves)
+        updates, state = optimiser.update(gradient, state, free)
+        finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all()
+        return optax.apply_updates(free, updates), state, (tuned, held_out, finite)
+
+    free, state = start, optimiser.init(start)
+    best, first = None, math.inf
+    for number in range(options.steps + 1):
+        moved, state, (tuned, held_out, finite) = advance(free, state, data)
+        losses = Losses(float(tuned), float(held_out))
+        if number == 0:
+            first = abs(losses.tuned) + 1.0
+        if not (math.isfinite(losses.tuned + losses.held_out) and finite) or losses.tuned > 100.0 * first:
+            raise JaxmapError(
+                f"the loss diverges: {losses.tuned:g}, held out {losses.held_out:g}, after {number} steps"
+                + ("; the best parameters before are kept" if best is not None else ""),
+                where="tuning",
+                fix="take a lower --learning-rate",
+            )
+        better = best is None or losses.held_out < best.losses.held_out
+        step = Step(number, losses, free, better)
+        best = step if better else best
+        on_step(step)
+        assert best is not None
+        if number - best.number >= options.patience:
+            break
+        free = moved
+    assert best is not None
+    return best

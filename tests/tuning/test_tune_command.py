@@ -1,0 +1,95 @@
+"""`jaxmap tune` from files to files, on the small scene."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+import yaml
+from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
+from tune_faults import tune_words, write_truth
+
+import jaxmap.tuning_run
+from jaxmap.config import load_config
+from jaxmap.errors import JaxmapError
+from jaxmap.map_store import load_map
+
+SHORT = ("--steps", "6", "--held-out-share", "0.4")
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    return write_truth(tmp_path_factory.mktemp("truth") / "truth.tif")
+
+
+def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
+    out = tmp_path / "fusion.yaml"
+    outcome = cli(*tune_words(scene_folder, truth, out, *SHORT, "--kernel", "3", "--frozen", "disparity_sigma_px"))
+    assert outcome.status == 0, outcome
+    assert "rock, tuned, best after" in outcome.out and "rock, with kernel, best after" in outcome.out
+    assert "wrote" in outcome.out
+
+    tree = yaml.safe_load(out.read_text())
+    assert not {"labels", "poses", "calibration", "start", "stop", "stride"} & tree.keys()
+    assert tree["depth"]["max_m"] and len(tree["grid"]["voxel_size_m"]) == 3
+    config = load_config(str(out))
+    assert config.fusion.disparity_sigma_px == 0.5
+    assert config.fusion.occupancy_hit != 0.85
+    assert np.shape(config.fusion.class_kernel) == (3, 3, 3)
+
+    told = json.loads(out.with_suffix(".json").read_text())
+    assert [stage["name"] for stage in told["stages"]] == ["tuned", "with kernel"]
+    for stage in told["stages"]:
+        held_out = [row["held_out"] for row in stage["history"]]
+        assert min(held_out) == held_out[stage["best_step"]]
+        assert stage["scores"]["held_out"]["nll"]["after"] is not None
+    assert told["traverses"][0]["held_out_cells"] < told["traverses"][0]["cells"]
+    assert told["before"]["occupancy_hit"] == pytest.approx(0.85)
+
+    page = out.with_suffix(".html").read_text()
+    assert page.startswith("<!doctype html>")
+    assert page.count("<svg") == 6
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+
+    run = tmp_path / "run"
+    labels = ("--labels", scene_folder / "labels", "--config", out)
+    outcome = cli(*map_words(scene_folder, run, *labels))
+    assert outcome.status == 0, outcome
+    _, attributes = load_map(run / "map.zarr")
+    np.testing.assert_allclose(attributes.fusion["params"]["class_kernel"], config.fusion.class_kernel)
+    assert cli("evaluate", run, truth).status == 0
+
+
+def test_what_was_best_is_on_disk_when_it_breaks(cli, scene_folder, truth, tmp_path, monkeypatch):
+    real, out = jaxmap.tuning_run.descend, tmp_path / "fusion.yaml"
+
+    def breaking(loss, start, options, *, data, moves, on_step):
+        def stop_later(step):
+            on_step(step)
+            if step.number == 2:
+                raise JaxmapError("the loss diverges", where="tuning", fix="take a lower --learning-rate")
+
+        return real(loss, start, options, data=data, moves=moves, on_step=stop_later)
+
+    monkeypatch.setattr(jaxmap.tuning_run, "descend", breaking)
+    outcome = cli(*tune_words(scene_folder, truth, out, *SHORT))
+    assert outcome.status == 1
+    assert "the loss diverges" in outcome.error
+    assert load_config(str(out)).fusion.class_increments is not None
+    assert not out.with_suffix(".json").exists()
+
+
+def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, truth, tmp_path):
+    out = tmp_path / "plane.yaml"
+    words = ["tune", scene_folder, scene_folder, "--ground-truth", truth, truth, "--out", out, *SHORT]
+    grid = tune_words(scene_folder, truth, out)[10:]
+    fit = ("--plane.hypotheses", "32", "--plane.sample-points", "512")
+    outcome = cli(*words, *grid, *fit)
+    assert outcome.status == 0, outcome
+    config, told = load_config(str(out)), json.loads(out.with_suffix(".json").read_text())
+    assert config.plane.softness_m > 0
+    assert len(told["traverses"]) == 2
+    assert told["before"]["softness_m"] == 0.0 and told["stages"][0]["parameters"]["softness_m"] > 0
+    assert {"sigma_m", "threshold_m"} <= told["before"].keys()
