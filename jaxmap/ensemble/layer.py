@@ -64,7 +64,9 @@ def ensemble_layers(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule)
     index = voxel_map.classes.index(target)
     own = top_down(voxel_map, params, rule)
     called = own.observed & (own.label == index)
-    read_one = replace(params, class_prior=params.class_prior[index : index + 1])
+    one = slice(index, index + 1)
+    kernel = None if params.class_kernel is None else params.class_kernel[one]
+    read_one = replace(params, class_prior=params.class_prior[one], class_kernel=kernel)
 
     def add(sums: tuple[Array, Array], log_odds: Array) -> tuple[tuple[Array, Array], None]:
         member = replace(voxel_map, log_odds=log_odds, classes=(target,), members=None)

@@ -67,7 +67,7 @@ def crop_frame(
     """
     view_key, light_key = jax.random.split(key)
     size_px = jnp.array([camera.height_px, camera.width_px])
-    view = draw_view(view_key, size_px, options)
+    view = draw_view(view_key, frame.anchors, size_px, options)
     image, anchors = cut(view, frame.images, frame.anchors, size_px, options.crop_px, fill)
     image = change_light_inside(light_key, view, image, size_px, options)
     density = points_per_pixel(options)

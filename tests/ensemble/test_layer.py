@@ -143,3 +143,13 @@ def test_layers_that_hold_no_probabilities_are_refused(value):
     layers = dict.fromkeys(layer_names("rock"), np.array([[np.nan, value]], np.float32))
     with pytest.raises(JaxmapError, match="no probability"):
         stored_layers(layers, "rock", "map.zarr")
+
+
+@given(rngs())
+@settings(max_examples=10)
+def test_members_that_are_the_map_itself_miss_nothing_whatever_the_kernel(rng):
+    kernel = jnp.asarray(rng.uniform(-0.3, 0.5, (len(CLASSES), 3, 3)), jnp.float32)
+    voxel_map, params = random_map(rng), replace(PARAMS, class_kernel=kernel)
+    own = voxel_map.log_odds[jnp.array([0, 1 + CLASSES.index("rock")])]
+    layers = ensemble_layers(replace(voxel_map, members=jnp.stack([own, own])), params, RULES[0])
+    assert np.nanmax(layers.missed) == 0.0
