@@ -139,7 +139,9 @@ slopes = jax.jit(jax.grad(loss_of, argnums=(0, 1)), static_argnums=3)
 @settings(max_examples=8, deadline=None)
 def test_gradients_equal_finite_differences(rule, seed):
     with jax.enable_x64(True):
-        params, log_odds, truth = doubled(PARAMS), doubled(a_map(seed)).log_odds, doubled(TRUTH)
+        kernel = np.random.default_rng(seed).uniform(-0.2, 0.3, (len(CLASSES), 3, 3))
+        params = doubled(replace(PARAMS, class_kernel=jnp.asarray(kernel, jnp.float32)))
+        log_odds, truth = doubled(a_map(seed)).log_odds, doubled(TRUTH)
         of_params, of_map = slopes(params, log_odds, truth, rule)
         rng = np.random.default_rng(seed)
         touched = np.asarray(log_odds != 0)

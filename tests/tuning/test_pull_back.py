@@ -130,8 +130,9 @@ def test_a_frame_labels_with_its_own_number():
     mapper = make_mapper(CAMERA, GRID, labeller, FusionRule(), DEPTH_RANGE_M)
     rng = np.random.default_rng(0)
     frames = [replace(scene_frame(index, rng), class_probabilities=None) for index in range(3)]
-    loss, expected = through_the_scan(mapper, stacked(frames), PARAMS)
-    found = map_gradient(mapper, frames, PARAMS, KEY, a_loss)
+    params = replace(PARAMS, labeller=labeller.params)
+    loss, expected = through_the_scan(mapper, stacked(frames), params)
+    found = map_gradient(mapper, frames, params, KEY, a_loss)
     np.testing.assert_allclose(found.loss, loss, rtol=1e-5)
     assert_close(found.gradient, expected)
 
