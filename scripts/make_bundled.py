@@ -19,12 +19,24 @@ import numpy as np
 from PIL import Image
 
 BUNDLED = Path(__file__).resolve().parents[1] / "jaxmap" / "bundled"
-LESSONS = {"--training": "268", "--seed": "5001", "--size": "384 512"}
-STAGES = {
-    "first": {},
-    "second": {"--epochs": "36", "--norm.backbone": "batch", "--norm.head": "batch"},
+LESSONS = (
+    {"--training": "268", "--seed": "5001", "--size": "384 512"},
+    {"--training": "200", "--seed": "5002", "--size": "576 768"},
+)
+"""Two sets of pictures; the larger ones show what the cameras of a rover see at their own size."""
+
+AGAIN = {"--norm.backbone": "batch", "--norm.head": "batch"}
+STAGES: dict[str, tuple[int, dict[str, str]]] = {
+    "first": (1, {}),
+    "second": (1, AGAIN | {"--epochs": "36"}),
+    "third": (
+        2,
+        AGAIN
+        | {"--epochs": "24", "--augmentation.class-share": "0.6"}
+        | {"--augmentation.crop-px": "320 448", "--augmentation.scale": "0.5 1.4"},
+    ),
 }
-"""The network is trained, and once more from there with the rate at its start."""
+"""The network is trained, and again from there with the rate at its start: on how many of the sets, and how."""
 TRAVERSE = {"--scene": "few", "--seed": "101"}
 JPEG_QUALITY = 93
 """The sample's images are JPEG files in full colour resolution; as PNG files they would be five times as large."""
@@ -44,14 +56,29 @@ def main() -> None:
 
 def make_model(work: Path) -> None:
     """Renders the lessons, trains on them, and copies the model."""
-    jaxmap("simulate", "--out", work / "lessons", *words(LESSONS))
+    sets = [work / f"lessons_{lessons['--seed']}" for lessons in LESSONS]
+    for folder, lessons in zip(sets, LESSONS, strict=True):
+        jaxmap("simulate", "--out", folder, *words(lessons))
     start: list[str | Path] = []
-    for name, options in STAGES.items():
-        run = work / name
+    for name, (count, options) in STAGES.items():
+        run, lessons = work / name, joined(work / f"lessons_of_{name}", sets[:count])
         resume = ["--resume"] if run.exists() else []
-        jaxmap("train", work / "lessons", "--out", run, "--config", "rover", *start, *words(options), *resume)
+        jaxmap("train", lessons, "--out", run, "--config", "rover", *start, *words(options), *resume)
         start = ["--init", run / "model.safetensors"]
     shutil.copyfile(start[1], BUNDLED / "rover.safetensors")
+
+
+def joined(folder: Path, sets: list[Path]) -> Path:
+    """A folder of the pictures of several sets, by links, with all their lists."""
+    for kind in ("images", "masks"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+        for path in (path for one in sets for path in sorted((one / kind).glob("*.png"))):
+            link = folder / kind / path.name
+            if not link.exists():
+                link.symlink_to(path.resolve())
+    for name in ("train.txt", "val.txt"):
+        (folder / name).write_text("".join((one / name).read_text() for one in sets))
+    return folder
 
 
 def make_traverse(work: Path) -> None:
