@@ -83,6 +83,7 @@ def test_the_results_tell_what_was_found(refined):
     page = (refined / "report.html").read_text()
     assert "<html" in page
     assert "heading deg" in page
+    assert 'class="chart"' in page and "svg.chart {" in page, "without its style, the curve is a black square"
     assert not (refined / "calibration.yaml").exists()
 
 
