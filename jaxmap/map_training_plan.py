@@ -113,6 +113,12 @@ def _check(config: TrainConfig) -> None:
             where="--supervision map",
             fix="name the network with --init and its classes with --classes",
         )
+    if config.mapping.ensemble.members:
+        raise UsageError(
+            "mapping.ensemble.members says nothing here: the network learns from one map",
+            where="--supervision map",
+            fix="leave it out",
+        )
 
 
 def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, MapTruth]]:

@@ -19,11 +19,12 @@ from jaxmap.datasets.crs import Extent, transform_between
 from jaxmap.datasets.height_raster import read_heights
 from jaxmap.datasets.label_raster import TARGET, UNLABELLED
 from jaxmap.datasets.pose_files import write_tum
-from jaxmap.errors import FrameError, JaxmapError, UsageError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.map_evaluation import TruthOptions, read_truth
 from jaxmap.output_folder import locked, write_json
 from jaxmap.prefetch import prefetch
+from jaxmap.refine_folder import CALIBRATION, RESULTS, forget_earlier
 from jaxmap.refinement.anchors import Raster
 from jaxmap.refinement.rounds import Ground, Refinement, refine
 from jaxmap.refinement.solve import Prior
@@ -199,20 +200,6 @@ def _check_heights(heights: Raster, sequence: StereoSequence, path: Path) -> Non
         )
 
 
-def check_apart(source: str, out: Path, options: ReadOptions) -> None:
-    """Refuses to write where the inputs lie; to be called before anything is made.
-
-    Raises:
-        UsageError: the folder is the sequence's own, or an output would overwrite an input.
-    """
-    if out.resolve() == Path(source).resolve():
-        raise UsageError("the folder is the sequence's own", where=out, fix="choose another --out")
-    inputs = {path.resolve() for path in (options.poses, options.calibration) if path is not None}
-    for name in ("poses.tum", "calibration.yaml"):
-        if (out / name).resolve() in inputs:
-            raise UsageError("an input would be overwritten", where=out / name, fix="choose another --out")
-
-
 def run_refine(
     source: str,
     out: Path,
@@ -254,13 +241,16 @@ def run_refine(
     with locked(out):
 
         def keep(state: Refinement) -> None:
+            first = not content
             content.clear()
             content.update(results(state, inputs.T_world_camera, prior))
             content["frames"] = [frame.name for frame in sequence.frames]
             content["skipped"] = inputs.skipped
             content["notes"] = [*notes, *state.notes]
             content["seconds"] = round(time.perf_counter() - started_s, 1)
-            _write(out, state, inputs, prior, content)
+            calibrated = _write(out, state, inputs, prior, content)
+            if first:
+                forget_earlier(out, calibrated=calibrated)
 
         state = refine(
             inputs.views,
@@ -276,18 +266,21 @@ def run_refine(
     return content
 
 
-def _write(out: Path, state: Refinement, inputs: RefineInputs, prior: Prior, content: dict[str, Any]) -> None:
+def _write(out: Path, state: Refinement, inputs: RefineInputs, prior: Prior, content: dict[str, Any]) -> bool:
+    """Writes results and poses, and the calibration where something of it was refined; whether it was."""
     sequence, front_end = inputs.sequence, inputs.front_end
     T_raw_rectified = front_end.T_raw_rectified
     T_world_raw = state.rig.T_world_camera @ np.linalg.inv(T_raw_rectified)
     T_world_raw[:, :3, 3] += sequence.site_origin
+    write_json(out / RESULTS, content)
     write_tum(out / "poses.tum", np.array([frame.timestamp_s for frame in sequence.frames]), T_world_raw)
-    write_json(out / "refine.json", content)
-    if prior.baseline_scale or prior.offset_px or prior.mounting_m or prior.mounting_rad:
-        # The displacement in the frame of the images as they lie on disk.
-        T_nominal_raw = T_raw_rectified @ state.rig.T_nominal_camera @ np.linalg.inv(T_raw_rectified)
-        mounted = T_nominal_raw if prior.mounting_m or prior.mounting_rad else None
-        write_camera_yaml(out / "calibration.yaml", _calibrated(sequence.camera, state), mounted)
+    if not (prior.baseline_scale or prior.offset_px or prior.mounting_m or prior.mounting_rad):
+        return False
+    # The displacement in the frame of the images as they lie on disk.
+    T_nominal_raw = T_raw_rectified @ state.rig.T_nominal_camera @ np.linalg.inv(T_raw_rectified)
+    mounted = T_nominal_raw if prior.mounting_m or prior.mounting_rad else None
+    write_camera_yaml(out / CALIBRATION, _calibrated(sequence.camera, state), mounted)
+    return True
 
 
 def _calibrated(camera: StereoCamera | StereoRig, state: Refinement) -> StereoCamera | StereoRig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import jaxmap
 from jaxmap.config import MapConfig
 from jaxmap.errors import UsageError
-from jaxmap.files import atomic_path
+from jaxmap.files import atomic_path, remove
 from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
 from jaxmap.mapping_plan import Plan, Tell, plan_run
 from jaxmap.output_folder import write_json, write_yaml
@@ -73,6 +74,15 @@ class TuneOptions:
             raise UsageError(
                 f"held_out_share is {self.held_out_share}", where="tuning", fix="give a share between 0 and 1"
             )
+        if not 0 < self.loss.rock_fraction <= 1:
+            raise UsageError(
+                f"rock_fraction is {self.loss.rock_fraction}", where="tuning", fix="give a share above 0, at most 1"
+            )
+        for name, value in (("class_weight", self.loss.class_weight), ("cell_size_m", self.cell_size_m)):
+            if not 0 < value < math.inf:
+                raise UsageError(f"{name} is {value}", where="tuning", fix="give a number above 0")
+        if not 0 <= self.loss.soft_iou < math.inf:
+            raise UsageError(f"iou_weight is {self.loss.soft_iou}", where="tuning", fix="give a number from 0 on")
 
 
 @dataclass(frozen=True)
@@ -152,6 +162,8 @@ class TuningRun:
                 crs=plan.sequence.crs,
             )
             raster = read_truth([source.truth], class_map.place, self._truth)
+            for note in raster.notes:
+                self._tell(f"note: {note}")
 
             def frames(plan: Plan = plan) -> Any:
                 nonlocal done
@@ -283,6 +295,9 @@ class TuningRun:
 
     def _write_config(self, params: TunedParams) -> None:
         write_yaml(self._out, tuned_tree(self._config, params))
+        # Scores and page of an earlier run are of other numbers; those of this one come at its end.
+        for suffix in (".json", ".html"):
+            remove(self._out.with_suffix(suffix))
 
     def _part(self, cells: list[ScoredCells], held_out: bool) -> ScoredCells:
         """Of the cells of all traverses, those that are held out, or those tuned on."""

@@ -109,6 +109,10 @@ TUNE_FAULTS: dict[str, tuple[int, Damage]] = {
     "tune: unknown parameter": (2, with_words("--frozen", "gravity")),
     "tune: even kernel": (2, with_words("--kernel", "4")),
     "tune: nothing held out": (2, with_words("--held-out-share", "0")),
+    "tune: rock weighs less than nothing": (2, with_words("--class-weight", "-1")),
+    "tune: weight that is no number": (2, with_words("--iou-weight", "nan")),
+    "tune: rock from no share on": (2, with_words("--rock-fraction", "0")),
+    "tune: cells without size": (2, with_words("--cell-size-m", "0")),
     "tune: no steps": (2, with_words("--steps", "0")),
 }
 """The exit status and the damage of each."""

@@ -80,9 +80,6 @@ class RefineArguments:
     """Take every so many frames."""
 
 
-OUTPUTS = ("poses.tum", "refine.json", "report.html", "consistency.png", "trajectory.png")
-
-
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(RefineArguments, "refine", words)
@@ -91,7 +88,8 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets import ReadOptions
     from jaxmap.map_evaluation import TruthOptions
-    from jaxmap.refine_run import GroundFiles, check_apart, run_refine
+    from jaxmap.refine_folder import CALIBRATION, OUTPUTS, check_apart
+    from jaxmap.refine_run import GroundFiles, run_refine
 
     keep_compiled_programs()
     # What ends a job is told like Ctrl-C; the best so far lies in the folder.
@@ -124,7 +122,7 @@ def main(words: Sequence[str]) -> int:
             tell=console.tell,
         )
     _print(console, content)
-    written = (*OUTPUTS, "calibration.yaml") if set(arguments.adjust) - {"poses"} else OUTPUTS
+    written = (*OUTPUTS, CALIBRATION) if set(arguments.adjust) - {"poses"} else OUTPUTS
     console.result(arguments.out, written)
     return 0
 

@@ -145,6 +145,9 @@ def _check(arguments: TuneArguments, config: MapConfig) -> None:
         raise UsageError(f"--out {arguments.out} is not a .yaml file", fix="name a YAML file")
     if arguments.remap and arguments.palette is not None:
         raise UsageError("--remap and --palette exclude each other", fix="give one of them")
+    inputs = (config.poses, config.calibration, arguments.palette, *arguments.poses_of)
+    if arguments.out.resolve() in {path.resolve() for path in inputs if path is not None}:
+        raise UsageError("an input would be overwritten", where=arguments.out, fix="choose another --out")
     there = [path for suffix in ("", ".json", ".html") if (path := _beside(arguments.out, suffix)).exists()]
     if there and not arguments.overwrite:
         raise UsageError("there already", where=there[0], fix="choose another --out, or add --overwrite")

@@ -99,7 +99,7 @@ def solve(rig: Rig, given: Rig, terms: Sequence[Term], prior: Prior, steps: int 
         steps: at most so many.
 
     Raises:
-        JaxmapError: the residuals are not finite.
+        JaxmapError: the residuals are not finite, or priors are too wide to solve for.
     """
     sigma = _prior_sigma(prior, len(given.T_world_nominal))
     free = sigma > 0
@@ -222,7 +222,15 @@ def _step(
     matrix[np.diag_indices_from(matrix)] *= 1 + damping
     # In units of the priors the matrix is well-conditioned: its least eigenvalue is 1.
     scale = sigma[free]
-    factor = cho_factor(matrix * scale[:, None] * scale)
+    try:
+        factor = cho_factor(matrix * scale[:, None] * scale)
+    except np.linalg.LinAlgError as error:
+        # Beside priors that say next to nothing, it is lost in rounding what only they decide.
+        raise JaxmapError(
+            "the refinement cannot be solved: some of its priors are too wide",
+            where="the standard deviations",
+            fix="give smaller ones: --sigma-position-m, --sigma-angle-deg, --sigma-mounting-m ...",
+        ) from error
     step, covariance = np.zeros(len(away)), np.zeros((len(away), len(away)))
     step[free] = -scale * cho_solve(factor, scale * (gradient[free] + weight * away[free]))
     covariance[np.ix_(free, free)] = scale[:, None] * cho_solve(factor, np.eye(len(scale))) * scale

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from html import escape
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,9 @@ def write_refine_report(out: Path, name: str, state: Refinement, content: dict[s
     """
     _draw_consistency(out / SPREAD, state)
     _draw_trajectory(out / TRAJECTORY, state)
+    style = files("jaxmap.report").joinpath("training_page.css").read_text(encoding="utf-8")
     sections = [
+        f"<style>{style}</style>",
         _header(name, content),
         _picture(out / SPREAD, "How much frames differ in the height of a column, before and after"),
         _picture(out / TRAJECTORY, "The cameras from above and from the side, before and after"),
@@ -103,7 +106,7 @@ def _parameters(title: str, rows: list[dict[str, Any]], *, with_value: bool) -> 
         for row in rows
     )
     return (
-        f'<section><h2>{title}</h2><div class="list"><table class="barred"><thead><tr>{head}</tr></thead>'
+        f'<section><h2>{title}</h2><div class="list"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div></section>"
     )
 
@@ -123,7 +126,7 @@ def _frames(content: dict[str, Any]) -> str:
     more = len(content["frames"]) - len(rows)
     told = f"<p>and {more} more, in refine.json</p>" if more > 0 else ""
     return (
-        '<section><h2>Frames</h2><details><summary>How far each went</summary><div class="list"><table class="barred">'
+        '<section><h2>Frames</h2><details><summary>How far each went</summary><div class="list"><table>'
         f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>{told}</details></section>"
     )
 

@@ -82,7 +82,7 @@ def _score_table(title: str, scores: Mapping[str, Any]) -> str:
         for key, name in _SCORES.items()
     )
     head = "".join(f'<th scope="col">{name}</th>' for name in ("", "before", "after", "change"))
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    table = f'<table class="barred"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
     return f"<figure><figcaption>{title}</figcaption>{table}</figure>"
 
 

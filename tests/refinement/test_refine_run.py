@@ -83,6 +83,7 @@ def test_the_results_tell_what_was_found(refined):
     page = (refined / "report.html").read_text()
     assert "<html" in page
     assert "heading deg" in page
+    assert 'class="chart"' in page and "svg.chart {" in page, "without its style, the curve is a black square"
     assert not (refined / "calibration.yaml").exists()
 
 
@@ -180,6 +181,23 @@ def test_bad_input_is_told_in_one_line(cli, scene_folder, tmp_path):
     status, error = fault(cli, scene_folder, scene_folder)
     assert (status, "the sequence's own" in error) == (2, True)
     assert fault(cli, scene_folder, scene_folder, "--poses", scene_folder / "poses.tum")[0] == 2
+
+
+def test_files_of_others_are_not_replaced(cli, scene_folder, tmp_path):
+    page = tmp_path / "report.html"
+    page.write_text("of a map")
+    status, error = fault(cli, scene_folder, tmp_path, "--stop", 2)
+    assert (status, "no refinement has written" in error) == (1, True)
+    assert page.read_text() == "of a map"
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_an_earlier_calibration_does_not_lie_beside_new_poses(cli, scene_folder, tmp_path):
+    for name in ("refine.json", "calibration.yaml"):
+        (tmp_path / name).write_text("{}")
+    assert cli("refine", scene_folder, "--out", tmp_path, "--stop", 2, "--max-depth-m", 5).status == 0
+    assert json.loads((tmp_path / "refine.json").read_text())["frames"] == ["f000", "f001"]
+    assert not (tmp_path / "calibration.yaml").exists()
 
 
 def test_frames_that_share_nothing_are_told(cli, scene_folder, tmp_path):

@@ -215,3 +215,10 @@ def test_residuals_that_are_not_finite_are_refused():
     with pytest.raises(JaxmapError, match="diverges"):
         solve(given, given, [match_term(matches)], POSES)
     assert replace(given, offset_px=1.0).offset_px == 1.0
+
+
+def test_priors_too_wide_to_solve_for_are_told():
+    given = make_rig(T_TRUE)
+    with pytest.raises(JaxmapError, match="too wide") as told:
+        solve(given, given, [match_term(matches_of(T_TRUE, np.random.default_rng(13)))], Prior(1e9, 1e9))
+    assert "--sigma-position-m" in str(told.value)

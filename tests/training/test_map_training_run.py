@@ -144,6 +144,7 @@ FAULTS = {
     "a loss of pixels": (2, ("--loss.lovasz", "1"), "are of pixels"),
     "no loss": (2, ("--loss.cross-entropy", "0", "--loss.soft-iou", "0"), "weight of 0"),
     "fixed copies": (2, ("--augmentation.copies", "3"), "is for images"),
+    "an ensemble": (2, ("--mapping.ensemble.members", "2"), "mapping.ensemble.members says nothing"),
     "another labeller": (2, ("--mapping.labels", "there"), "mapping.labels says nothing"),
     "classes that the network has not": (2, ("--classes", "background", "mud", "rock"), "would be random"),
     "a truth of one known class": (2, ("--map-truth.remap", "1=mud", "2=rock"), "fewer than two classes"),

@@ -15,6 +15,7 @@ import jaxmap.tuning_run
 from jaxmap.config import load_config
 from jaxmap.errors import JaxmapError
 from jaxmap.map_store import load_map
+from jaxmap.tuning.descent import Losses, Step
 
 SHORT = ("--steps", "6", "--held-out-share", "0.4")
 
@@ -79,6 +80,36 @@ def test_what_was_best_is_on_disk_when_it_breaks(cli, scene_folder, truth, tmp_p
     assert "the loss diverges" in outcome.error
     assert load_config(str(out)).fusion.class_increments is not None
     assert not out.with_suffix(".json").exists()
+
+
+def test_what_is_assumed_of_the_ground_truth_is_told(cli, scene_folder, truth, tmp_path):
+    words = ("--steps", "1", "--held-out-share", "0.4", "--crs", "EPSG:32631")
+    outcome = cli(*tune_words(scene_folder, truth, tmp_path / "fusion.yaml", *words))
+    assert outcome.status == 0, outcome
+    assert "truth.tif has no CRS" in outcome.err
+
+
+def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder, truth, tmp_path, monkeypatch):
+    out = tmp_path / "fusion.yaml"
+    for suffix in (".yaml", ".json", ".html"):
+        out.with_suffix(suffix).write_text("of an earlier run")
+
+    def breaking(loss, start, options, *, data, moves, on_step):
+        on_step(Step(0, Losses(1.0, 1.0), start, best=True))
+        raise JaxmapError("the loss diverges", where="tuning", fix="take a lower --learning-rate")
+
+    monkeypatch.setattr(jaxmap.tuning_run, "descend", breaking)
+    assert cli(*tune_words(scene_folder, truth, out, *SHORT, "--overwrite")).status == 1
+    assert load_config(str(out)).fusion.class_increments is not None
+    assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
+
+
+def test_an_input_is_not_overwritten(cli, scene_folder, truth, tmp_path):
+    camera = tmp_path / "camera.yaml"
+    camera.write_bytes((scene_folder / "camera.yaml").read_bytes())
+    outcome = cli(*tune_words(scene_folder, truth, camera, *SHORT, "--overwrite", "--calibration", camera))
+    assert (outcome.status, "would be overwritten" in outcome.error) == (2, True)
+    assert camera.read_bytes() == (scene_folder / "camera.yaml").read_bytes()
 
 
 def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, truth, tmp_path):
