@@ -57,8 +57,9 @@ def cameras(draw: st.DrawFn, doffs: bool = True) -> StereoCamera:
 
 @st.composite
 def poses(draw: st.DrawFn, reach_m: float = 3.0) -> jaxlie.SE3:
-    angles = [draw(st.floats(-3.1, 3.1)) for _ in range(3)]
-    position = [draw(st.floats(-reach_m, reach_m)) for _ in range(3)]
+    # To micrometres and microradians: below, float32 has subnormal numbers, which XLA takes for zero.
+    angles = [round(draw(st.floats(-3.1, 3.1)), 6) for _ in range(3)]
+    position = [round(draw(st.floats(-reach_m, reach_m)), 6) for _ in range(3)]
     return jaxlie.SE3.from_rotation_and_translation(
         jaxlie.SO3.from_rpy_radians(*angles), jnp.asarray(position, jnp.float32)
     )
