@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PRNGKeyArray, PyTree, UInt8
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from jaxmap.ensemble.draws import EnsembleParams
 from jaxmap.ensemble.members import Site, fuse_members
@@ -90,6 +91,7 @@ def make_mapper(
     depth_range_m: tuple[float, float],
     *,
     members: int = 0,
+    T_world_camera: Float[np.ndarray, "N 4 4"] | None = None,
 ) -> Mapper:
     """Builds a mapper.
 
@@ -102,6 +104,8 @@ def make_mapper(
         depth_range_m: points nearer or farther than these are left out.
         members: of an ensemble that is fused beside the map; its params then hold `ensemble`, its frames
             `pose_errors`.
+        T_world_camera: the poses of all frames, where they are known beforehand: the windows then are no larger
+            than these need. What a frame of another pose sees beyond its window is left out.
 
     Raises:
         JaxmapError: a depth range that is none, or an ensemble without a class to ask about.
@@ -109,7 +113,7 @@ def make_mapper(
     min_depth_m, max_depth_m = depth_range_m
     if not 0 <= min_depth_m < max_depth_m < float("inf"):
         raise JaxmapError(f"depth range {min_depth_m} to {max_depth_m} m", where="mapper", fix="take 0 <= min < max")
-    reach = Reach(depth_range_m, window_shape(grid, camera, max_depth_m))
+    reach = Reach(depth_range_m, window_shape(grid, camera, max_depth_m, T_world_camera))
     target = rule.target(labeller.classes)
     if members and target is None:
         raise JaxmapError(

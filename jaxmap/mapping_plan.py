@@ -169,7 +169,16 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         rule=fusion_rule,
         params=MapperParams(camera, fusion_params, labeller.params, ensemble),
         fusion={"params": params, "rule": rule} | ({"ensemble": asdict(config.ensemble)} if members else {}),
-        mapper=make_mapper(camera, grid, labeller, fusion_rule, depth_range_m, members=members),
+        mapper=make_mapper(
+            camera,
+            grid,
+            labeller,
+            fusion_rule,
+            depth_range_m,
+            members=members,
+            # The members of an ensemble stand elsewhere.
+            T_world_camera=None if members else sequence.T_world_camera @ front_end.T_raw_rectified,
+        ),
         key=key,
         pose_errors=pose_errors,
     )

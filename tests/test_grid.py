@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from strategies import BAD_NUMBERS, GRID_SHAPE, HEIGHT_PX, WIDTH_PX, cameras, grids, points_in, poses, rngs
 
 from jaxmap.geometry import grid as kernels
+from jaxmap.geometry.camera import frustum_corners, transform_points
 from jaxmap.types import make_grid, make_stereo_camera
 
 to_voxel = jax.jit(kernels.world_to_voxel)
@@ -82,6 +83,20 @@ def test_view_window_holds_every_voxel_the_camera_can_reach(camera, T_world_came
     points_world = reference.transform_points(T_world_camera, points_camera.reshape(-1, 3))
     index, inside = reference.world_to_voxel(grid, points_world)
     assert np.all((index[inside] >= start) & (index[inside] < stop))
+
+
+@given(cameras(doffs=False), st.lists(poses(reach_m=8.0), min_size=1, max_size=3), st.floats(0.5, 6.0))
+def test_a_window_for_known_poses_holds_their_views_and_is_no_larger_than_one_for_any_pose(camera, known, max_depth_m):
+    grid = make_grid([-20, -20, -12], [20, 20, 12], (0.4, 0.2, 0.3))
+    matrices = np.stack([reference.pose_matrix(pose) for pose in known])
+    shape = kernels.window_shape(grid, camera, max_depth_m, matrices)
+    assert np.all(np.array(shape) <= kernels.window_shape(grid, camera, max_depth_m))
+    corners = frustum_corners(camera, max_depth_m)
+    for pose in known:
+        start = np.asarray(kernels.view_window(grid, camera, pose, max_depth_m, shape).start)
+        # By the kernel, in float32: points are put into voxels by the same rounding that places the window.
+        index, inside = map(np.asarray, to_voxel(grid, transform_points(pose, corners)))
+        assert np.all((index[inside] >= start) & (index[inside] < start + shape))
 
 
 def test_view_window_of_a_pose_that_is_no_place_stays_in_the_grid():

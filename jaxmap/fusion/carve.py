@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmap.fusion.params import FusionParams
 from jaxmap.geometry.camera import depth_sigma, points_to_pixels, transform_points
-from jaxmap.geometry.grid import voxel_centres
+from jaxmap.geometry.grid import Window, voxel_centres
 from jaxmap.types import GridSpec, StereoCamera
 
 _MARGIN_SIGMAS = 2.0
@@ -23,6 +23,7 @@ def carve(
     grid: GridSpec,
     params: FusionParams,
     depth_range_m: tuple[float, float] = (0.0, float("inf")),
+    window: Window | None = None,
 ) -> Bool[Array, "X Y Z"]:
     """Which voxels the camera saw through.
 
@@ -34,12 +35,13 @@ def carve(
         T_world_camera: its pose.
         depth_m: measured depth along the optical axis.
         valid: where that depth is real; elsewhere nothing is known to be free.
-        grid: the voxels asked about.
+        grid: whose voxels are asked about.
         params: `disparity_sigma_px` sets the depth noise.
         depth_range_m: nearer and farther voxels are left alone.
+        window: the part of the grid that is asked about; all of it if not given.
     """
     with jax.named_scope("carve"):
-        centres_camera = transform_points(T_world_camera.inverse(), voxel_centres(grid))
+        centres_camera = transform_points(T_world_camera.inverse(), voxel_centres(grid, window))
         u_px, v_px, _, in_front = points_to_pixels(camera, centres_camera)
         height, width = depth_m.shape
         column, row = jnp.round(u_px), jnp.round(v_px)

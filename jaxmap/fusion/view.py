@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
@@ -47,5 +48,11 @@ def view_of(
         weights = range_weight(camera, window.grid, depth_m.reshape(-1), params)
     free = None
     if rule.carve:
-        free = carve(camera, T_world_camera, depth_m, valid, window.grid, params, depth_range_m=reach.depth_range_m)
+        free = jax.lax.cond(
+            # Nothing is fused across a conditional: as a part of what reads it, carving would be computed anew for
+            # each of its readers.
+            valid.any(),
+            lambda: carve(camera, T_world_camera, depth_m, valid, grid, params, reach.depth_range_m, window),
+            lambda: jnp.zeros(window.grid.shape, bool),
+        )
     return View(window, weights, free)

@@ -28,12 +28,6 @@ def world_to_voxel(grid: GridSpec, points_world: Float[Array, "*s 3"]) -> tuple[
     return jnp.where(inside[..., None], scaled, 0.0).astype(jnp.int32), inside
 
 
-def voxel_centres(grid: GridSpec) -> Float[Array, "X Y Z 3"]:
-    """World positions of all voxel centres, in metres."""
-    axes = [grid.origin_m[i] + (jnp.arange(grid.shape[i]) + 0.5) * grid.voxel_size_m[i] for i in range(3)]
-    return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1)
-
-
 def exact_corner(grid: GridSpec) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Origin and voxel size as the short decimals that their float32 stand for, float64: 0.2, not 0.20000000298.
 
@@ -74,21 +68,41 @@ def flat_voxel_index(
     return jnp.where(inside, flat, int(np.prod(shape)))
 
 
+def voxel_centres(grid: GridSpec, window: Window | None = None) -> Float[Array, "X Y Z 3"]:
+    """World positions of the voxel centres of a window, in metres; of the whole grid without one."""
+    window = whole_window(grid) if window is None else window
+    # Counted from the origin of the whole grid: a voxel's centre is the same number through any window.
+    axes = [
+        grid.origin_m[i] + (window.start[i] + jnp.arange(window.grid.shape[i]) + 0.5) * grid.voxel_size_m[i]
+        for i in range(3)
+    ]
+    return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
 def whole_window(grid: GridSpec) -> Window:
     """The window that is the whole grid."""
     return Window(jnp.zeros(3, jnp.int32), grid)
 
 
-def window_shape(grid: GridSpec, camera: StereoCamera, max_depth_m: float) -> tuple[int, int, int]:
-    """Voxels along each axis that hold the view of the camera, however it is turned.
+def window_shape(
+    grid: GridSpec,
+    camera: StereoCamera,
+    max_depth_m: float,
+    T_world_camera: Float[np.ndarray, "N 4 4"] | None = None,
+) -> tuple[int, int, int]:
+    """Voxels along each axis that hold the view of the camera: from each of the poses, or however it is turned.
 
-    The view is the pyramid from the camera to `max_depth_m`; its greatest diameter bounds its
-    extent in every direction. Host side, static.
+    The view is the pyramid from the camera to `max_depth_m`. Where the poses are not known, its greatest diameter
+    bounds its extent in every direction. Host side, static.
     """
     corners = np.asarray(frustum_corners(camera, max_depth_m), np.float64)
-    diameter_m = np.linalg.norm(corners[:, None] - corners[None], axis=-1).max()
+    if T_world_camera is None:
+        extent_m = np.full(3, np.linalg.norm(corners[:, None] - corners[None], axis=-1).max())
+    else:
+        # Turned only: where a camera stands does not change how far it sees to each side.
+        extent_m = np.ptp(np.einsum("nij,kj->nki", T_world_camera[:, :3, :3], corners), axis=1).max(axis=0)
     # One voxel for a start that is not aligned, one more for rounding.
-    needed = np.ceil(diameter_m / np.asarray(grid.voxel_size_m, np.float64)).astype(int) + 2
+    needed = np.ceil(extent_m / np.asarray(grid.voxel_size_m, np.float64)).astype(int) + 2
     x, y, z = (min(int(n), s) for n, s in zip(needed, grid.shape, strict=True))
     return x, y, z
 
