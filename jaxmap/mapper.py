@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -113,84 +114,13 @@ def make_mapper(
     min_depth_m, max_depth_m = depth_range_m
     if not 0 <= min_depth_m < max_depth_m < float("inf"):
         raise JaxmapError(f"depth range {min_depth_m} to {max_depth_m} m", where="mapper", fix="take 0 <= min < max")
-    reach = Reach(depth_range_m, window_shape(grid, camera, max_depth_m, T_world_camera))
-    target = rule.target(labeller.classes)
-    if members and target is None:
+    if members and rule.target(labeller.classes) is None:
         raise JaxmapError(
             "an ensemble needs a class whose misses it tells", where="mapper", fix="name one in priority_classes"
         )
-
-    def init() -> VoxelMap:
-        return make_voxel_map(grid, labeller.classes, members)
-
-    def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
-        """The labelled points of a frame; `key` is the frame's own."""
-        if labeller.needs is not None and getattr(frame, labeller.needs) is None:
-            raise JaxmapError(
-                f"the frame has no {labeller.needs}", where=f"{labeller.name} labeller", fix="fill that field of Frame"
-            )
-        if jax.tree.structure(params.labeller) != jax.tree.structure(labeller.params):
-            raise JaxmapError(
-                "the params hold other numbers than the labeller's",
-                where=f"{labeller.name} labeller",
-                fix="build MapperParams with labeller=labeller.params",
-            )
-        points_camera, valid = disparity_to_points(params.camera, frame.disparity_px)
-        depth_m = points_camera[..., 2]
-        in_range = valid & (depth_m >= min_depth_m) & (depth_m <= max_depth_m)
-        points_world = transform_points(frame.T_world_camera, points_camera).reshape(-1, 3)
-        # Kept apart: labeller and scatter would each compute the points anew, one by one.
-        points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
-        labels, plane = labeller.label(frame, points_world, in_range.reshape(-1), params.labeller, key)
-        return _Observation(depth_m, valid, in_range, points_world, labels, plane)
-
-    def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
-        frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
-        seen = observe(frame, params, frame_key)
-        labels = harden(seen.labels) if rule.per_frame == "once" else seen.labels
-        view = view_of(
-            voxel_map.grid, params.camera, frame.T_world_camera, seen.depth_m, seen.valid, params.fusion, rule, reach
-        )
-        fused, hits = integrate(
-            voxel_map,
-            seen.points_world,
-            labels,
-            view.weights,
-            params.fusion,
-            rule,
-            window=view.window,
-            free=view.free,
-        )
-        if members:
-            fused = replace(fused, members=fuse_ensemble(voxel_map, frame, labels, params, frame_key))
-        free = view.free
-        info = StepInfo(
-            points_valid=seen.valid.sum(),
-            points_in_range=seen.in_range.sum(),
-            points_kept=labels.keep.sum(),
-            voxels_hit=(hits > 0).sum(),
-            voxels_freed=(free & (hits == 0)).sum() if free is not None else jnp.zeros((), jnp.int32),
-            plane=seen.plane,
-        )
-        return fused, info
-
-    def fuse_ensemble(
-        voxel_map: VoxelMap, frame: Frame, labels: PointLabels, params: MapperParams, frame_key: PRNGKeyArray
-    ) -> Array:
-        if params.ensemble is None or frame.pose_errors is None:
-            raise JaxmapError(
-                "the ensemble has no numbers to draw by",
-                where="mapper",
-                fix="fill MapperParams.ensemble and Frame.pose_errors",
-            )
-        assert target is not None
-        classes = labeller.classes
-        site = Site(params.camera, voxel_map.grid, rule, reach, len(classes), classes.index(target))
-        # Kept apart, so that the map comes out as it does without members.
-        frame, labels = jax.lax.optimization_barrier((frame, labels))
-        return fuse_members(
-            voxel_map, frame, labels, site, params.ensemble, jax.random.fold_in(frame_key, _ENSEMBLE_DRAW)
-        )
+    reach = Reach(depth_range_m, window_shape(grid, camera, max_depth_m, T_world_camera))
+    design = _Design(labeller, rule, reach, members)
+    fuse = partial(_fuse, design)
 
     def scan(voxel_map: VoxelMap, frames: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
         return jax.lax.scan(lambda carried, frame: fuse(carried, frame, params, key), voxel_map, frames)
@@ -207,14 +137,15 @@ def make_mapper(
     def lower(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> jax.stages.Lowered:
         return compiled.lower(*_apart(voxel_map), frame, params, key)
 
-    @jax.jit
-    def label_image(frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]) -> Array:
-        labels = harden(observe(frame, params, jax.random.fold_in(key, number)).labels)
-        assert labels.labels is not None
-        hard = jnp.where(labels.keep, labels.labels, IGNORE)
-        return hard.astype(jnp.uint8).reshape(frame.disparity_px.shape)
-
-    return Mapper(init, step, fuse, jax.jit(scan), label_image, lower, compiled._cache_size)
+    return Mapper(
+        init=lambda: make_voxel_map(grid, labeller.classes, members),
+        step=step,
+        fuse=fuse,
+        scan=jax.jit(scan),
+        label_image=jax.jit(partial(_label_image, design)),
+        lower=lower,
+        compilations=compiled._cache_size,
+    )
 
 
 class StepCost(NamedTuple):
@@ -244,6 +175,15 @@ def compile_step(
     return mapper._replace(step=step), StepCost(compile_s, memory.temp_size_in_bytes if memory else 0)
 
 
+class _Design(NamedTuple):
+    """What is decided before the step is compiled."""
+
+    labeller: Labeller
+    rule: FusionRule
+    reach: Reach
+    members: int
+
+
 class _Observation(NamedTuple):
     """The labelled points of one frame; images are (H, W), lists (H W)."""
 
@@ -253,6 +193,91 @@ class _Observation(NamedTuple):
     points_world: Array
     labels: PointLabels
     plane: Plane | None
+
+
+def _observe(design: _Design, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
+    """The labelled points of a frame; `key` is the frame's own."""
+    labeller = design.labeller
+    if labeller.needs is not None and getattr(frame, labeller.needs) is None:
+        raise JaxmapError(
+            f"the frame has no {labeller.needs}", where=f"{labeller.name} labeller", fix="fill that field of Frame"
+        )
+    if jax.tree.structure(params.labeller) != jax.tree.structure(labeller.params):
+        raise JaxmapError(
+            "the params hold other numbers than the labeller's",
+            where=f"{labeller.name} labeller",
+            fix="build MapperParams with labeller=labeller.params",
+        )
+    min_depth_m, max_depth_m = design.reach.depth_range_m
+    points_camera, valid = disparity_to_points(params.camera, frame.disparity_px)
+    depth_m = points_camera[..., 2]
+    in_range = valid & (depth_m >= min_depth_m) & (depth_m <= max_depth_m)
+    points_world = transform_points(frame.T_world_camera, points_camera).reshape(-1, 3)
+    # Kept apart: labeller and scatter would each compute the points anew, one by one.
+    points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
+    labels, plane = labeller.label(frame, points_world, in_range.reshape(-1), params.labeller, key)
+    return _Observation(depth_m, valid, in_range, points_world, labels, plane)
+
+
+def _fuse(
+    design: _Design, voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray
+) -> tuple[VoxelMap, StepInfo]:
+    """The step itself: one frame into the map."""
+    rule, grid = design.rule, voxel_map.grid
+    frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
+    seen = _observe(design, frame, params, frame_key)
+    labels = harden(seen.labels) if rule.per_frame == "once" else seen.labels
+    view = view_of(
+        grid, params.camera, frame.T_world_camera, seen.depth_m, seen.valid, params.fusion, rule, design.reach
+    )
+    fused, hits = integrate(
+        voxel_map, seen.points_world, labels, view.weights, params.fusion, rule, window=view.window, free=view.free
+    )
+    if design.members:
+        fused = replace(fused, members=_fuse_ensemble(design, voxel_map, frame, labels, params, frame_key))
+    free = view.free
+    info = StepInfo(
+        points_valid=seen.valid.sum(),
+        points_in_range=seen.in_range.sum(),
+        points_kept=labels.keep.sum(),
+        voxels_hit=(hits > 0).sum(),
+        voxels_freed=(free & (hits == 0)).sum() if free is not None else jnp.zeros((), jnp.int32),
+        plane=seen.plane,
+    )
+    return fused, info
+
+
+def _fuse_ensemble(
+    design: _Design,
+    voxel_map: VoxelMap,
+    frame: Frame,
+    labels: PointLabels,
+    params: MapperParams,
+    frame_key: PRNGKeyArray,
+) -> Array:
+    """The members of the ensemble, with the frame in each."""
+    if params.ensemble is None or frame.pose_errors is None:
+        raise JaxmapError(
+            "the ensemble has no numbers to draw by",
+            where="mapper",
+            fix="fill MapperParams.ensemble and Frame.pose_errors",
+        )
+    classes, target = design.labeller.classes, design.rule.target(design.labeller.classes)
+    assert target is not None
+    site = Site(params.camera, voxel_map.grid, design.rule, design.reach, len(classes), classes.index(target))
+    # Kept apart, so that the map comes out as it does without members.
+    frame, labels = jax.lax.optimization_barrier((frame, labels))
+    return fuse_members(voxel_map, frame, labels, site, params.ensemble, jax.random.fold_in(frame_key, _ENSEMBLE_DRAW))
+
+
+def _label_image(
+    design: _Design, frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]
+) -> UInt8[Array, "H W"]:
+    """See `Mapper.label_image`."""
+    labels = harden(_observe(design, frame, params, jax.random.fold_in(key, number)).labels)
+    assert labels.labels is not None
+    hard = jnp.where(labels.keep, labels.labels, IGNORE)
+    return hard.astype(jnp.uint8).reshape(frame.disparity_px.shape)
 
 
 class _Tensors(NamedTuple):

@@ -143,9 +143,7 @@ def _observer(recipe: CacheRecipe) -> Any:
         free = None
         if recipe.rule.carve:
             pose = frame.T_world_camera
-            free = carve(
-                params.camera, pose, depth_m, valid, recipe.grid, params.fusion, recipe.depth_range_m, window
-            )
+            free = carve(params.camera, pose, depth_m, valid, recipe.grid, params.fusion, recipe.depth_range_m, window)
         keep = cues.keep & jnp.isfinite(cues.values).all(axis=-1)
         return {
             "voxel": flat_voxel_index(recipe.grid, points_world, keep, whole_window(recipe.grid)),
