@@ -44,6 +44,7 @@ def main() -> int:
     parser.add_argument("--config", help="configuration of jaxmap map")
     parser.add_argument("--voxel-size-m", type=float, nargs="+", default=[0.2, 0.1])
     parser.add_argument("--frames", type=int, default=8, help="how many, spread over the sequence")
+    parser.add_argument("--speckle-window", type=int, help="drop matches in islands of at most so many pixels")
     parser.add_argument("--out", type=Path, default=Path("octomap_agreement"))
     given = parser.parse_args()
     if importlib.util.find_spec("octomap") is None:
@@ -66,7 +67,8 @@ def compared(source: str, voxel_size_m: float, given: argparse.Namespace) -> dic
     plan = planned(source, voxel_size_m, given)
     maps = map_both(frames_of(plan, given.frames), plan.mapper, plan.params, plan.grid, plan.depth_range_m)
     found = explain(maps, plan.front_end.camera, plan.grid, plan.params.fusion, plan.depth_range_m)
-    name = f"{plan.sequence.name}, voxels of {voxel_size_m:g} m, {len(maps.frames)} frames"
+    cleaned = "" if given.speckle_window is None else f", no islands up to {given.speckle_window} px"
+    name = f"{plan.sequence.name}, voxels of {voxel_size_m:g} m, {len(maps.frames)} frames{cleaned}"
     row = as_row(maps, found, name)
     dem = truth_folder(source) / "dem.tif"
     if dem.is_file():
@@ -81,9 +83,13 @@ def planned(source: str, voxel_size_m: float, given: argparse.Namespace) -> Plan
     """The run of `jaxmap map`, with the rule that OctoMap has."""
     config = load_config(given.config) if given.config else MapConfig()
     poses = truth_folder(source) / "poses_utm.tum"
+    stereo = config.stereo
+    if given.speckle_window is not None:
+        stereo = replace(stereo, speckle_window=given.speckle_window)
     config = replace(
         config,
         labeller="none",
+        stereo=stereo,
         grid=replace(config.grid, voxel_size_m=voxel_size_m),
         fusion=replace(config.fusion, per_frame="once", carve=True, range_weighting=False),
         **({"poses": poses, "max_pose_gap_s": 10.0} if poses.is_file() else {}),
@@ -151,7 +157,7 @@ def print_row(row: dict[str, Any]) -> None:
         f"  one class: {row['agreement_both']:.2%} of the voxels that both observed, "
         f"{row['agreement_either']:.2%} of those that either did"
     )
-    truth = row.get("against_truth")
+    truth = row.get("against_truth", {})
     header = "".join(f"{name:>20s}" for name in TRUTH_NAMES) if truth else ""
     kinds = (("observed by both, otherwise", "causes_of_conflicts", "conflicts"),)
     kinds += (("observed by one", "causes_of_observed_by_one", "observed by one"),)

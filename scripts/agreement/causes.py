@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from agreement.maps import FREE, MISS, NOTHING, OCCUPIED, UNKNOWN, Seen, TwoMaps
+from agreement.maps import MISS, NOTHING, UNKNOWN, Seen, TwoMaps
 from jaxmap.fusion.params import FusionParams
 from jaxmap.geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
 from jaxmap.types import GridSpec, StereoCamera
@@ -16,10 +16,14 @@ from jaxmap.types import GridSpec, StereoCamera
 MARGIN_SIGMAS = 2.0
 """Of depth noise, that `carve` keeps before a surface."""
 
+STRAY_SHARE = 0.25
+"""Where fewer of the pixels that a voxel covers have a disparity, those are islands: mismatches, mostly."""
+
 CAUSES = {
     "grazing": "grazing ray: the surface is less than half a diagonal away",
     "noise": "depth noise: nearer to the surface than two sigmas",
     "behind": "edge or thin object: seen past, its centre is hidden",
+    "stray": "stray points: its pixel has no disparity, nor have most of its pixels",
     "hole": "its centre's pixel has no disparity",
     "far": "its centre's pixel sees beyond the mapped depths",
     "view": "its centre lies outside the image",
@@ -107,9 +111,11 @@ def _frame_cause(
     pixel = (np.where(in_view, row, 0).astype(int), np.where(in_view, column, 0).astype(int))
     measured_m, known = np.asarray(points[..., 2])[pixel], np.asarray(valid)[pixel]
     low_m, high_m = depth_range_m
+    half_width_px = 0.5 * float(np.mean(grid.voxel_size_m)) * float(camera.fx_px) / np.maximum(depth_m, 1e-3)
     gap_m = measured_m - depth_m
     half_diagonal_m = 0.5 * float(np.linalg.norm(np.asarray(grid.voxel_size_m)))
-    noise_m = MARGIN_SIGMAS * np.asarray(depth_sigma(camera, measured_m, float(params.disparity_sigma_px)))
+    sigma_m = depth_sigma(camera, jnp.asarray(measured_m), params.disparity_sigma_px)
+    noise_m = MARGIN_SIGMAS * np.asarray(sigma_m)
     ours, theirs = seen.ours[where], seen.theirs[where]
     crossed = (theirs == MISS) & (ours == NOTHING)
     # In this order: what is found first is the cause.
@@ -118,6 +124,7 @@ def _frame_cause(
         "rounding": (ours != theirs) & ~crossed,
         "range": (depth_m < low_m) | (depth_m > high_m),
         "view": ~in_view,
+        "stray": ~known & (_share_known(np.asarray(valid), pixel, half_width_px) < STRAY_SHARE),
         "hole": ~known,
         "far": (measured_m < low_m) | (measured_m > high_m),
         "behind": gap_m < -half_diagonal_m,
@@ -128,10 +135,15 @@ def _frame_cause(
     return np.where(ours == theirs, -1, found)
 
 
-def kinds_of(maps: TwoMaps) -> dict[str, int]:
-    """How the differing voxels differ, such as `ours occupied, OctoMap free`."""
-    names = {UNKNOWN: "unknown", FREE: "free", OCCUPIED: "occupied"}
-    table = agreement_of(maps).confusion
-    return {
-        f"ours {names[i]}, OctoMap {names[j]}": int(table[i, j]) for i in names for j in names if i != j and table[i, j]
-    }
+def _share_known(
+    valid: Bool[np.ndarray, "H W"], pixel: tuple[np.ndarray, np.ndarray], half_width_px: Float[np.ndarray, "N"]
+) -> Float[np.ndarray, "N"]:
+    """Share of the pixels in squares about some pixels that have a disparity, from a summed-area table."""
+    table = np.pad(valid.astype(np.int64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    reach = np.rint(half_width_px).clip(0, max(valid.shape)).astype(int)
+    (top, left), (bottom, right) = (
+        tuple((at + way).clip(0, size) for at, way, size in zip(pixel, ways, valid.shape, strict=True))
+        for ways in ((-reach, -reach), (reach + 1, reach + 1))
+    )
+    known = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+    return known / ((bottom - top) * (right - left))

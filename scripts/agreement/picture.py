@@ -20,14 +20,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_SIZE_IN = (11.6, 7.0)
+_SIZE_INCHES = (11.6, 7.6)
 _AGREED_FREE, _AGREED_OCCUPIED, _CONFLICT = (214, 225, 233), (74, 78, 88), (178, 40, 46)
 _CAUSE_COLOURS = {
     "grazing": (224, 122, 60),
     "noise": (238, 178, 72),
     "behind": (46, 134, 124),
-    "hole": (142, 118, 178),
-    "far": (190, 170, 214),
+    "stray": (120, 84, 160),
+    "hole": (176, 130, 196),
+    "far": (206, 192, 226),
     "view": (92, 146, 206),
     "range": (176, 176, 120),
     "no_ray": (20, 20, 20),
@@ -57,17 +58,17 @@ def draw_agreement(maps: TwoMaps, differences: Differences, grid: GridSpec, titl
     kinds = kinds_of_voxels(maps, differences)
     box = _observed_box(kinds)
     slices = [_fullest(kinds, 1, "A"), _fullest(kinds, 0, "B")]
-    figure = Figure(figsize=_SIZE_IN, dpi=DPI, facecolor="white")
+    figure = Figure(figsize=_SIZE_INCHES, dpi=DPI, facecolor="white")
     figure.text(0.055, 0.955, title, size=13, weight="bold", color=INK, va="center")
     figure.text(0.055, 0.918, _summary(maps), size=9.5, color=INK, va="center")
-    _draw(figure.add_axes((0.055, 0.09, 0.44, 0.78)), from_above(kinds), grid, (0, 1), box, "seen from above")
+    _draw(figure.add_axes((0.055, 0.09, 0.44, 0.775)), from_above(kinds), grid, (0, 1), box, "seen from above")
     _mark(figure.axes[0], slices, grid)
-    for cut, bottom in zip(slices, (0.64, 0.40), strict=True):
+    for cut, bottom in zip(slices, (0.655, 0.385), strict=True):
         along = 1 - cut.axis
         place_m = exact_corner(grid)[0][cut.axis] + (cut.index + 0.5) * exact_corner(grid)[1][cut.axis]
         name = f"slice {cut.letter}, at {'xy'[cut.axis]} = {place_m:.2f} m"
         colours = _palette()[kinds.take(cut.index, axis=cut.axis)]
-        _draw(figure.add_axes((0.555, bottom, 0.42, 0.22)), colours, grid, (along, 2), box, name)
+        _draw(figure.add_axes((0.575, bottom, 0.41, 0.21)), colours, grid, (along, 2), box, name)
     _draw_legend(figure, differences)
     with atomic_path(path) as temporary:
         FigureCanvasAgg(figure).print_png(temporary)
@@ -87,9 +88,8 @@ def from_above(kinds: Int8[np.ndarray, "X Y Z"]) -> UInt8[np.ndarray, "X Y 3"]:
     palette, count = _palette().astype(np.float64), _FIRST_CAUSE + len(CAUSES)
     amounts = np.stack([(kinds == kind).sum(axis=2) for kind in range(count)], axis=-1)
     observed, differing = amounts[..., 1:].sum(axis=-1), amounts[..., _BOTH:]
-    agreed = np.where((amounts[..., _OCCUPIED] > 0)[..., None], palette[_OCCUPIED], palette[_FREE])
     share = (differing.sum(axis=-1) / np.maximum(observed, 1))[..., None]
-    colours = (1 - share) * agreed + share * palette[_BOTH + differing.argmax(axis=-1)]
+    colours = (1 - share) * palette[_FREE] + share * palette[_BOTH + differing.argmax(axis=-1)]
     colours[amounts[..., _BOTH] > 0] = palette[_BOTH]
     colours[observed == 0] = palette[_EMPTY]
     return np.rint(colours).astype(np.uint8)
@@ -181,7 +181,14 @@ def _draw_legend(figure: Figure, differences: Differences) -> None:
         for name, colour in swatches
     ]
     legend = figure.legend(
-        handles=handles, loc="upper left", bbox_to_anchor=(0.545, 0.37), fontsize=8.5, frameon=False, labelcolor=INK,
-        title="voxels (from above: the strongest difference of the column)\nobserved by OctoMap alone, because:",
-    )  # fmt: skip
-    legend.get_title().set(size=8.5, color=INK)
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=(0.565, 0.325),
+        fontsize=8,
+        frameon=False,
+        labelcolor=INK,
+        alignment="left",
+        title="Voxels; those with a cause were observed by one map only.\n"
+        "From above: the column's main difference, as strong as its share.",
+    )
+    legend.get_title().set(size=8, color=INK)
