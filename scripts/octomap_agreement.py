@@ -44,6 +44,7 @@ def main() -> int:
     parser.add_argument("--config", help="configuration of jaxmap map")
     parser.add_argument("--voxel-size-m", type=float, nargs="+", default=[0.2, 0.1])
     parser.add_argument("--frames", type=int, default=8, help="how many, spread over the sequence")
+    parser.add_argument("--stop", type=int, help="frame to stop before, as for jaxmap map")
     parser.add_argument("--speckle-window", type=int, help="drop matches in islands of at most so many pixels")
     parser.add_argument("--out", type=Path, default=Path("octomap_agreement"))
     given = parser.parse_args()
@@ -68,15 +69,23 @@ def compared(source: str, voxel_size_m: float, given: argparse.Namespace) -> dic
     maps = map_both(frames_of(plan, given.frames), plan.mapper, plan.params, plan.grid, plan.depth_range_m)
     found = explain(maps, plan.front_end.camera, plan.grid, plan.params.fusion, plan.depth_range_m)
     cleaned = "" if given.speckle_window is None else f", no islands up to {given.speckle_window} px"
-    name = f"{plan.sequence.name}, voxels of {voxel_size_m:g} m, {len(maps.frames)} frames{cleaned}"
+    site = site_of(source, plan)
+    name = f"{site}, voxels of {voxel_size_m:g} m, {len(maps.frames)} frames{cleaned}"
     row = as_row(maps, found, name)
     dem = truth_folder(source) / "dem.tif"
     if dem.is_file():
-        row["against_truth"] = against_truth(maps, found, true_voxels(dem, plan.sequence, plan.grid))
+        truth = true_voxels(dem, plan.grid, plan.sequence.site_origin, plan.sequence.crs)
+        row["against_truth"] = against_truth(maps, found, truth)
     print_row(row)
-    file = f"{Path(source.replace(':', '_')).resolve().parent.name}_{plan.sequence.name}_{voxel_size_m:g}m.png"
-    draw_agreement(maps, found, plan.grid, f"Projective carving and OctoMap: {name}", given.out / file)
+    picture = given.out / f"{site.replace(' ', '_')}_{voxel_size_m:g}m.png"
+    draw_agreement(maps, found, plan.grid, f"Projective carving and OctoMap: {name}", picture)
     return row
+
+
+def site_of(source: str, plan: Plan) -> str:
+    """What a sequence is called: parts of traverses are told apart by the folder that they lie in."""
+    folder, name = Path(source).resolve().parent.name, plan.sequence.name
+    return name if not Path(source).exists() or folder in name else f"{folder} {name}"
 
 
 def planned(source: str, voxel_size_m: float, given: argparse.Namespace) -> Plan:
@@ -90,6 +99,7 @@ def planned(source: str, voxel_size_m: float, given: argparse.Namespace) -> Plan
         config,
         labeller="none",
         stereo=stereo,
+        stop=given.stop if given.stop is not None else config.stop,
         grid=replace(config.grid, voxel_size_m=voxel_size_m),
         fusion=replace(config.fusion, per_frame="once", carve=True, range_weighting=False),
         **({"poses": poses, "max_pose_gap_s": 10.0} if poses.is_file() else {}),
@@ -106,7 +116,7 @@ def frames_of(plan: Plan, count: int) -> Iterator[Frame]:
     """So many frames, at even distances over the sequence; those that cannot be used are left out."""
     every = len(plan.sequence.frames)
     chosen = sorted({round(index) for index in np.linspace(0, every - 1, min(count, every))})
-    frames = [plan.sequence.frames[index] for index in chosen]
+    frames = tuple(plan.sequence.frames[index] for index in chosen)
     sequence = replace(plan.sequence, frames=frames, T_world_camera=plan.sequence.T_world_camera[chosen])
     return (ready.frame for ready in prepare_frames(sequence, plan.front_end) if ready.frame is not None)
 
@@ -162,7 +172,8 @@ def print_row(row: dict[str, Any]) -> None:
     kinds = (("observed by both, otherwise", "causes_of_conflicts", "conflicts"),)
     kinds += (("observed by one", "causes_of_observed_by_one", "observed by one"),)
     for title, key, part in kinds:
-        print(f"  {title:66s}{'voxels':>9s}{header}")
+        if any(row[key].values()):
+            print(f"  {title:66s}{'voxels':>9s}{header}")
         for cause, count in sorted(row[key].items(), key=lambda item: -item[1]):
             if count:
                 cells = "".join(f"{number:20,d}" for number in truth[part][cause]) if truth else ""

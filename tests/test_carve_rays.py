@@ -14,9 +14,11 @@ import reference
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from reference_rays import cast_rays, walk
 from strategies import HEIGHT_PX, WIDTH_PX, cameras, rngs
 from test_carve import SHARP, see_through, views
+from truth_files import CRS, SITE, write_raster
 
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.labellers import make_no_labeller
@@ -26,6 +28,7 @@ from jaxmap.types import Frame, GridSpec, make_grid, make_stereo_camera
 sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts"))
 
 from agreement.causes import CAUSES, agreement_of, explain
+from agreement.heights import ABOVE, BELOW, NO_TRUTH, SURFACE, true_voxels
 from agreement.maps import (
     FREE,
     OCCUPIED,
@@ -40,6 +43,7 @@ from agreement.maps import (
     map_classes,
     octree_classes,
 )
+from agreement.picture import draw_agreement, from_above, kinds_of_voxels
 
 DEPTH_RANGE_M = (0.3, 5.0)
 FRAMES = 5
@@ -169,6 +173,42 @@ def test_every_difference_has_one_cause(mapped):
     assert conflicts["no_ray"] == alone["no_ray"] == 0
     assert conflicts["rounding"] + alone["rounding"] <= 0.001 * (maps.theirs != 0).sum()
     assert alone["behind"] > 0 and alone["noise"] > 0
+
+
+def test_the_picture_shows_each_class_and_each_cause_that_occurs(mapped, tmp_path):
+    maps, setting = mapped
+    found = explain(maps, setting.params.camera, setting.grid, setting.params.fusion, DEPTH_RANGE_M)
+    kinds = kinds_of_voxels(maps, found)
+    assert ((kinds == 0) == ((maps.ours == UNKNOWN) & (maps.theirs == UNKNOWN))).all()
+    assert (
+        (kinds == 3).sum()
+        == found.both.sum()
+        == agreement_of(maps).confusion[1:, 1:].sum() - (((kinds == 1) | (kinds == 2)).sum())
+    )
+    colours = from_above(kinds)
+    conflict = (kinds == 3).any(axis=2)
+    assert conflict.any() and len(np.unique(colours[conflict], axis=0)) == 1
+    assert not (colours[~conflict] == colours[conflict][0]).all(axis=-1).any()
+    draw_agreement(maps, found, setting.grid, "scene", tmp_path / "scene.png")
+    picture = np.asarray(Image.open(tmp_path / "scene.png").convert("RGB"))
+    assert picture.shape[0] > 900 and (picture == colours[conflict][0]).all(axis=-1).any()
+
+
+def test_voxels_are_told_apart_by_the_lowest_and_the_highest_ground_in_them(tmp_path):
+    # A step from 46.05 to 46.65 m in the middle of the second column from the west; the north-east is not known.
+    heights = np.full((4, 8), 46.05, np.float32)
+    heights[:, 3:] = 46.65
+    heights[:2, 6:] = np.nan
+    path = write_raster(tmp_path / "dem.tif", heights, SITE[0], SITE[1] + 0.4, 0.1)
+    grid = make_grid([0, 0, 0.8], [0.8, 0.4, 2.0], 0.2)
+    truth = true_voxels(path, grid, SITE, CRS)
+    assert truth.shape == (4, 2, 6)
+    low = [BELOW, SURFACE, ABOVE, ABOVE, ABOVE, ABOVE]
+    step = [BELOW, SURFACE, SURFACE, SURFACE, SURFACE, ABOVE]
+    high = [BELOW, BELOW, BELOW, BELOW, SURFACE, ABOVE]
+    for y in (0, 1):
+        np.testing.assert_array_equal(truth[:3, y], [low, step, high])
+    np.testing.assert_array_equal(truth[3], [high, [NO_TRUTH] * 6])
 
 
 def test_octomap_is_the_twin_and_agrees(mapped):
