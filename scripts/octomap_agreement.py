@@ -69,8 +69,8 @@ def compared(source: str, voxel_size_m: float, given: argparse.Namespace) -> dic
     maps = map_both(frames_of(plan, given.frames), plan.mapper, plan.params, plan.grid, plan.depth_range_m)
     found = explain(maps, plan.front_end.camera, plan.grid, plan.params.fusion, plan.depth_range_m)
     cleaned = "" if given.speckle_window is None else f", no islands up to {given.speckle_window} px"
-    site = site_of(source, plan)
-    name = f"{site}, voxels of {voxel_size_m:g} m, {len(maps.frames)} frames{cleaned}"
+    site, frames = site_of(source, plan), len(maps.frames)
+    name = f"{site}, voxels of {voxel_size_m:g} m, {frames} frame{'s' if frames > 1 else ''}{cleaned}"
     row = as_row(maps, found, name)
     dem = truth_folder(source) / "dem.tif"
     if dem.is_file():
@@ -85,7 +85,7 @@ def compared(source: str, voxel_size_m: float, given: argparse.Namespace) -> dic
 def site_of(source: str, plan: Plan) -> str:
     """What a sequence is called: parts of traverses are told apart by the folder that they lie in."""
     folder, name = Path(source).resolve().parent.name, plan.sequence.name
-    return name if not Path(source).exists() or folder in name else f"{folder} {name}"
+    return f"{folder} {name}" if plan.sequence.dataset == "katwijk" and folder not in name else name
 
 
 def planned(source: str, voxel_size_m: float, given: argparse.Namespace) -> Plan:

@@ -63,12 +63,12 @@ def draw_agreement(maps: TwoMaps, differences: Differences, grid: GridSpec, titl
     figure.text(0.055, 0.918, _summary(maps), size=9.5, color=INK, va="center")
     _draw(figure.add_axes((0.055, 0.09, 0.44, 0.775)), from_above(kinds), grid, (0, 1), box, "seen from above")
     _mark(figure.axes[0], slices, grid)
-    for cut, bottom in zip(slices, (0.655, 0.385), strict=True):
+    for cut, bottom in zip(slices, (0.67, 0.385), strict=True):
         along = 1 - cut.axis
         place_m = exact_corner(grid)[0][cut.axis] + (cut.index + 0.5) * exact_corner(grid)[1][cut.axis]
         name = f"slice {cut.letter}, at {'xy'[cut.axis]} = {place_m:.2f} m"
         colours = _palette()[kinds.take(cut.index, axis=cut.axis)]
-        _draw(figure.add_axes((0.575, bottom, 0.41, 0.21)), colours, grid, (along, 2), box, name)
+        _draw(figure.add_axes((0.575, bottom, 0.41, 0.195)), colours, grid, (along, 2), box, name)
     _draw_legend(figure, differences)
     with atomic_path(path) as temporary:
         FigureCanvasAgg(figure).print_png(temporary)
