@@ -16,20 +16,14 @@ The process is bound to two cores and keeps the memory it frees, which helps all
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
+
+from benchmarks.threads import limit_threads
 
 ROOT = Path(__file__).resolve().parent.parent
 BASELINE = Path(__file__).with_name("bench_baseline.json")
 SIZES = ("small", "medium", "large")
-
-
-def limit_threads(count: int) -> None:
-    """Must run before the libraries are loaded, which read it once."""
-    os.environ["OMP_NUM_THREADS"] = str(count)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
 
 
 def parse() -> argparse.Namespace:

@@ -73,7 +73,9 @@ def fuse(size: str) -> Case:
         octomap("OctoMap, ray casting", RAY_LIMIT, discretize=False),
         octomap("OctoMap, discretised", DISCRETE_LIMIT, discretize=True),
         Peer(
-            "of which its binding's conversion", lambda: peers.octomap_binding(len(points), edge_m), modules=("octomap",)
+            "of which its binding's conversion",
+            lambda: peers.octomap_binding(len(points), edge_m),
+            modules=("octomap",),
         ),
         Peer("touched memory once", lambda: _touched_once(scene, prepared), COPY_LIMIT, gated),
     ]

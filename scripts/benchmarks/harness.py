@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import importlib.util
+import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
-
 Run = Callable[[], object]
+Clock = Callable[[], float]
 
 LEAST_ROUNDS, MOST_ROUNDS = 3, 25
 TURNS = 3
 """How often at most the fast ones run in a round, where another takes as long as several of their runs."""
 SLOW_S = 1.0
+"""Runs as slow are warmed up once."""
 PAUSE_S = 0.02
-"""Before each turn: threads of the one before may still be spinning."""
+"""Before each turn."""
 
 
 class Amount(NamedTuple):
@@ -73,7 +74,7 @@ class Case:
 
 
 def measure(
-    case: Case, budget_s: float, *, clock: Callable[[], float] = time.perf_counter, pause: Run | None = None
+    case: Case, budget_s: float, *, clock: Clock = time.perf_counter, pause: Run | None = None
 ) -> dict[str, Any]:
     """Times a case and its peers.
 
@@ -110,30 +111,39 @@ def measure(
     return result
 
 
-def interleaved(
-    runs: Sequence[Run], budget_s: float, clock: Callable[[], float], pause: Run | None = None
-) -> list[list[float]]:
+def interleaved(runs: Sequence[Run], budget_s: float, clock: Clock, pause: Run | None = None) -> list[list[float]]:
     """Seconds of each run, turn by turn, after a run or two of each that do not count."""
-    pause = pause or (lambda: time.sleep(PAUSE_S))
     first_s = [warmed_up(run, clock) for run in runs]
     turns = [min(TURNS, max(1, round(max(first_s) / max(own_s, 1e-9)))) for own_s in first_s]
     round_s = sum(count * own_s for count, own_s in zip(turns, first_s, strict=True))
     rounds = int(min(MOST_ROUNDS, max(LEAST_ROUNDS, budget_s / max(round_s, 1e-9))))
+    return in_turn(runs, turns, rounds, clock, pause)
+
+
+def in_turn(
+    runs: Sequence[Run], turns: Sequence[int], rounds: int, clock: Clock = time.perf_counter, pause: Run | None = None
+) -> list[list[float]]:
+    """Seconds of each run, each so many times in every round."""
     times_s: list[list[float]] = [[] for _ in runs]
     for _ in range(rounds):
         for run, count, record in zip(runs, turns, times_s, strict=True):
-            pause()
+            (pause or _rest)()
             record.extend(timed(run, clock) for _ in range(count))
     return times_s
 
 
-def warmed_up(run: Run, clock: Callable[[], float]) -> float:
-    """Seconds of a run that is warm: of the first where it is slow, as setting up counts little then, else the second."""
+def _rest() -> None:
+    """Threads of the one before may still be spinning."""
+    time.sleep(PAUSE_S)
+
+
+def warmed_up(run: Run, clock: Clock) -> float:
+    """Seconds of a run that is warm: the second, or the first where it is so slow that setting up counts little."""
     first_s = timed(run, clock)
     return first_s if first_s > SLOW_S else timed(run, clock)
 
 
-def timed(run: Run, clock: Callable[[], float] = time.perf_counter) -> float:
+def timed(run: Run, clock: Clock = time.perf_counter) -> float:
     """Seconds of one run."""
     started_s = clock()
     run()
@@ -142,8 +152,9 @@ def timed(run: Run, clock: Callable[[], float] = time.perf_counter) -> float:
 
 def summary(times_s: Sequence[float]) -> dict[str, float]:
     """The median and the spread (the distance of the quartiles), in milliseconds."""
-    low, median, high = np.percentile(1e3 * np.asarray(times_s, np.float64), [25, 50, 75])
-    return {"median_ms": significant(median), "spread_ms": significant(high - low), "runs": len(times_s)}
+    quartiles = statistics.quantiles(times_s, n=4, method="inclusive") if len(times_s) > 1 else [times_s[0]] * 3
+    low, median, high = (significant(1e3 * quartile) for quartile in quartiles)
+    return {"median_ms": median, "spread_ms": significant(high - low), "runs": len(times_s)}
 
 
 def significant(value: float) -> float:

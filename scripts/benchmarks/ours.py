@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,11 +19,12 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from golden.seeded_weights import seeded_state_of
+from safetensors.numpy import save_file
 
-from benchmarks.scene import DEPTH_RANGE_M, Scene, grid_of, moved_poses
+from benchmarks.scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_poses
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.deeplab_labeller import make_deeplab_labeller
-from jaxmap.files import bundled
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
 from jaxmap.fusion.params import FusionRule, make_fusion_params
@@ -33,12 +35,14 @@ from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.labellers import Labeller, make_no_labeller, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapper import Mapper, MapperParams, compile_step, make_mapper
-from jaxmap.models.checkpoint import load_network
+from jaxmap.models.checkpoint import SavedModel
+from jaxmap.models.importers import import_weights
 from jaxmap.sequence import prepare_frames, run_sequence
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions
 from jaxmap.types import Frame, GridSpec, PointLabels, VoxelMap, make_voxel_map
 
+BACKBONE = "mobilenet_v2"
 NETWORK_PX = (384, 512)
 """Height and width that the network sees."""
 UP = (0.0, 0.0, 1.0)
@@ -184,16 +188,25 @@ def fuse_frame(scene: Scene, size: str) -> Prepared:
 
 
 @cache
+def network_model() -> SavedModel:
+    """DeepLabv3+ on MobileNetV2 as segmentation_models_pytorch builds it, with the weights that the peers have too."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_file(seeded_state_of(BACKBONE), Path(folder) / "smp.safetensors")
+        imported = import_weights(Path(folder) / "smp.safetensors")
+    return SavedModel(imported.architecture, imported.weights, imported.holds)
+
+
+@cache
 def labeller_of(name: str) -> Labeller:
-    """The labellers by name; `deeplab` is the bundled MobileNetV2 at 384 x 512."""
+    """The labellers by name; `deeplab` sees 384 x 512."""
     if name == "deeplab":
-        return make_deeplab_labeller(load_network(bundled("rover.safetensors")), size_px=NETWORK_PX)
+        return make_deeplab_labeller(network_model(), size_px=NETWORK_PX)
     return make_plane_labeller(ROVER_CLASSES) if name == "plane" else make_no_labeller()
 
 
 def label_pixels(scene: Scene, size_px: tuple[int, int]) -> Prepared:
     """The network alone: class probabilities of all pixels of the scene's image, seen at `size_px` (height, width)."""
-    labeller = make_deeplab_labeller(load_network(bundled("rover.safetensors")), size_px=size_px)
+    labeller = make_deeplab_labeller(network_model(), size_px=size_px)
     frame = Frame(jnp.asarray(scene.disparity_px), scene.pose, image=jnp.asarray(scene.left))
     nowhere, valid = jnp.zeros((scene.pixels, 3)), jnp.ones(scene.pixels, bool)
 
@@ -246,7 +259,7 @@ def map_sequence(scene: Scene, folder: Path, frames: int, size: str) -> Prepared
     """A whole sequence into an empty map, as `jaxmap map` does it: read, match, label by the network, carve, fuse."""
     sequence = open_sequence(folder, ReadOptions(stop=frames))
     labeller = labeller_of("deeplab")
-    front_end = StereoFrontEnd(scene.camera, StereoOptions(num_disparities=scene.disparities))
+    front_end = StereoFrontEnd(scene.camera, StereoOptions(num_disparities=DISPARITIES))
     mapper, params = mapper_of(scene, labeller, size)
     key = jax.random.key(0)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -12,20 +11,21 @@ import cv2
 import numpy as np
 
 from benchmarks.harness import Peer, Run
-from benchmarks.scene import Scene
+from benchmarks.scene import DISPARITIES, Scene
+from benchmarks.threads import usable_cores
 
 SIGMA_M = 0.05
 """Points as near to a plane are its inliers, for all."""
 
 
 def sgbm(scene: Scene, calls: int = 1) -> Peer:
-    """OpenCV's SGBM in its 3WAY mode with an eighth of the width as disparities, so many times in a row."""
+    """OpenCV's SGBM in its 3WAY mode with 128 disparities, on grey images, so many times in a row."""
     times = "" if calls == 1 else f", {calls} times"
 
     def make() -> Run:
         block = 5
         matcher = cv2.StereoSGBM.create(
-            numDisparities=scene.disparities,
+            numDisparities=DISPARITIES,
             blockSize=block,
             P1=8 * block**2,
             P2=32 * block**2,
@@ -44,7 +44,7 @@ def sgbm(scene: Scene, calls: int = 1) -> Peer:
 
         return run
 
-    return Peer(f"SGBM 3WAY, {scene.disparities} disparities{times}", make)
+    return Peer(f"SGBM 3WAY, {DISPARITIES} disparities{times}", make)
 
 
 def octomap_insertion(
@@ -63,11 +63,9 @@ def octomap_insertion(
 
 
 def octomap_binding(count: int, resolution_m: float) -> Run:
-    """What OctoMap's Python binding takes to turn so many points into a C++ cloud: all lie in the voxel of the origin."""
+    """What OctoMap's binding takes to turn so many points into a C++ cloud: all lie in the voxel of the origin."""
     origin = np.full(3, resolution_m / 2)
-    return octomap_insertion(
-        np.tile(origin, (count, 1)), origin, resolution_m, discretize=True, max_range_m=-1.0
-    )
+    return octomap_insertion(np.tile(origin, (count, 1)), origin, resolution_m, discretize=True, max_range_m=-1.0)
 
 
 def open3d_cloud(points: np.ndarray) -> Any:
@@ -104,7 +102,13 @@ def open3d_plane(points: np.ndarray, iterations: int, probability: float) -> Pla
 
 
 class _PlaneModel:
-    """A plane as `skimage.measure.ransac` takes models."""
+    """A plane as `skimage.measure.ransac` takes models: since 0.26 by `from_estimate`, before by `estimate`."""
+
+    @classmethod
+    def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
+        model = cls()
+        model.estimate(points)
+        return model
 
     def estimate(self, points: np.ndarray) -> bool:
         self.centre = points.mean(axis=0)
@@ -116,15 +120,13 @@ class _PlaneModel:
 
 
 def skimage_plane(points: np.ndarray, trials: int) -> PlaneFit:
-    """scikit-image's `ransac` with a plane, all trials made; it does not refit to all inliers but by SVD of them."""
+    """scikit-image's `ransac` with a plane, all trials made."""
     from skimage.measure import ransac
 
     random = np.random.default_rng(0)
 
     def fit() -> np.ndarray:
-        model, _ = ransac(
-            points, _PlaneModel, 3, SIGMA_M, max_trials=trials, stop_probability=1.0, rng=random
-        )
+        model, _ = ransac(points, _PlaneModel, 3, SIGMA_M, max_trials=trials, stop_probability=1.0, rng=random)
         return np.append(model.normal, -model.normal @ model.centre)
 
     return PlaneFit(fit)
@@ -156,7 +158,7 @@ def memory_pass(read: Sequence[np.ndarray], updated_floats: int, threads: int | 
         updated_floats: numbers that are read and written.
         threads: by default as many as the process may use.
     """
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or usable_cores()
     flat = [array.reshape(-1).view(np.int32 if array.itemsize == 4 else np.int8) for array in read]
     target = np.zeros(updated_floats, np.float32)
     shares = [[part[index] for part in (np.array_split(array, threads) for array in flat)] for index in range(threads)]

@@ -54,7 +54,9 @@ def mlesac(size: str) -> Case:
         return Peer(name, kept, limit, modules=(module,))
 
     def facts() -> Mapping[str, float]:
-        errors = {name: np.median([plane_errors(plane, truth) for plane in one.planes], 0) for name, one in fits.items()}
+        errors = {
+            name: np.median([plane_errors(plane, truth) for plane in one.planes], 0) for name, one in fits.items()
+        }
         names = ("angle to the true plane, degrees", "height off the true plane, mm")
         return {f"{what}: {who}": two[index] for index, what in enumerate(names) for who, two in errors.items()}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import importlib.metadata
-import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ import jax
 from benchmarks.gate import Cases, verdicts
 from benchmarks.groups import Group, case_name
 from benchmarks.harness import measure
+from benchmarks.threads import usable_cores
 from benchmarks.wording import case_lines
 from jaxmap.host_memory import peak_resident_mib
 
@@ -47,7 +47,7 @@ def machine() -> dict[str, Any]:
     """What the figures were measured on."""
     return {
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": usable_cores(),
         "device": jax.devices()[0].device_kind,
         "python": platform.python_version(),
         "versions": dict(_versions(LIBRARIES)),

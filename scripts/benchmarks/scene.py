@@ -27,6 +27,8 @@ IMAGE_PX = {"small": (512, 384), "medium": (1024, 768), "large": (2048, 1536)}
 """Width and height; the LocCam's in the middle."""
 VOXEL_M = {"small": (0.4, 0.4, 0.4), "medium": (0.2, 0.2, 0.2), "large": DEFAULT_VOXELS_M[0]}
 """The paper's voxels in the middle, the default ones last."""
+DISPARITIES = 128
+"""That are searched where matching is timed, at all sizes."""
 LOWER_M, UPPER_M = (0.0, 0.0, -2.0), (40.0, 40.0, 2.0)
 DEPTH_RANGE_M = (0.3, 12.0)
 FRAME_STEP_M, FRAME_STEP_S = 0.2, 0.1
@@ -52,11 +54,6 @@ class Scene:
         return self.left.shape[0] * self.left.shape[1]
 
     @property
-    def disparities(self) -> int:
-        """Disparities that are searched: an eighth of the width."""
-        return self.left.shape[1] // 8
-
-    @property
     def grey(self) -> list[np.ndarray]:
         """Both images in grey."""
         return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (self.left, self.right)]
@@ -68,9 +65,9 @@ class Scene:
 
     @cached_property
     def disparity_px(self) -> np.ndarray:
-        """Disparity by SGBM 3WAY, NaN where there is none."""
-        options = StereoOptions(num_disparities=self.disparities, pad_left=False)
-        return Matcher(options, self.left.shape[1])(self.left, self.right)
+        """Disparity by SGBM 3WAY, NaN where there is none; as many are searched as the size asks for."""
+        width_px = self.left.shape[1]
+        return Matcher(StereoOptions(num_disparities=width_px // 8, pad_left=False), width_px)(self.left, self.right)
 
 
 @cache

@@ -11,7 +11,7 @@ import reference
 from benchmarks import ours, peers
 from benchmarks.groups import Group
 from benchmarks.harness import Amount, Case, Peer, Run
-from benchmarks.scene import Scene, make_scene
+from benchmarks.scene import DISPARITIES, Scene, make_scene
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.files import config_folder
 from jaxmap.stereo.match import Matcher
@@ -67,7 +67,7 @@ def _float_maps(scene: Scene, rig: StereoRig) -> Run:
 def match(size: str) -> Case:
     """From an RGB pair to disparity with NaN, the leftmost columns too, against SGBM alone on grey images."""
     scene = make_scene(size)
-    matcher = Matcher(StereoOptions(num_disparities=scene.disparities), scene.left.shape[1])
+    matcher = Matcher(StereoOptions(num_disparities=DISPARITIES), scene.left.shape[1])
     return Case(
         lambda: matcher(scene.left, scene.right),
         *_pixels(scene),
@@ -79,7 +79,7 @@ def project(size: str) -> Case:
     """Disparity to points in the world."""
     scene = make_scene(size)
     prepared = ours.project(scene)
-    beside = [Peer("OpenCV, reprojectImageTo3D and transform", lambda: peers.opencv_points(scene), limit=0.5)]
+    beside = [Peer("OpenCV, reprojectImageTo3D and transform", lambda: peers.opencv_points(scene), limit=1.0)]
     if size == "small":
         beside.append(Peer("NumPy twin", lambda: _twin(scene)))
     return Case(prepared.run, *_pixels(scene), beside, prepared.compile_s, prepared.temporary_bytes)
@@ -108,6 +108,6 @@ def _pixels(scene: Scene) -> tuple[Amount, Amount]:
 
 GROUPS = (
     Group("rectify", "both images of a pair, by the LocCam's calibration", rectify),
-    Group("match", "disparity of a pair, as many disparities as an eighth of its width", match),
+    Group("match", "disparity of a pair, 128 disparities", match),
     Group("project", "disparity to points in the world", project),
 )
