@@ -20,7 +20,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.harness import Run, in_turn, timed
+from benchmarks.harness import Run as Runner
+from benchmarks.harness import in_turn, timed
 from benchmarks.threads import limit_threads
 from jaxmap.host_memory import restart_with_lasting_memory
 
@@ -28,7 +29,6 @@ ROOT = Path(__file__).resolve().parent.parent
 SIZES = ((384, 512), (512, 512))
 BATCH, CROP = 8, (384, 384)
 RATE, DECAY = 1e-3, 1e-4
-Runner = Run
 
 
 def ours(state: dict, image) -> tuple[Runner, float]:

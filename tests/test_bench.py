@@ -16,7 +16,9 @@ from benchmarks.gate import bound, merged, verdicts
 from benchmarks.groups import Group, all_groups
 from benchmarks.growth import growth_of, growth_picture
 from benchmarks.harness import LEAST_ROUNDS, MOST_ROUNDS, TURNS, Amount, Case, Peer, measure, summary
+from benchmarks.network_peers import NetworkPeers
 from benchmarks.page import bench_page
+from benchmarks.peers import memory_pass
 from benchmarks.plane_cases import plane_errors, tilted_cloud
 from benchmarks.wording import case_lines, speed_text, time_text
 
@@ -184,7 +186,31 @@ def test_the_committed_baseline_is_of_cases_that_there_are():
     assert all(figures["median_ms"] > 0 for figures in cases.values())
 
 
-def test_groups_are_found_by_name(capsys: pytest.CaptureFixture):
+@pytest.mark.slow
+@pytest.mark.parametrize("group", all_groups(), ids=lambda group: group.name)
+def test_every_case_runs_with_the_functions_of_now(group: Group):
+    case = group.build("small")
+    case.run()
+    assert case.grown.count > 0 and case.work.count > 0
+    assert len({peer.name for peer in case.peers}) == len(case.peers)
+    assert not any(peer.gated and peer.limit is not None for peer in case.peers), "targets are set for larger sizes"
+
+
+def test_networks_of_libraries_that_are_not_installed_are_left_out(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert NetworkPeers("mobilenet_v2", {}, np.zeros((1, 8, 8, 3), np.uint8), 1).installed() == {}
+
+
+def test_a_pass_over_memory_reads_all_and_writes_what_it_is_told():
+    read = [np.zeros((7, 3), np.float32), np.ones(5, bool), np.array([0, 0, 0, 9], np.int32)]
+    once = memory_pass(read, 10, threads=3)
+    once()
+    shares = once()
+    assert max(greatest for greatest, _ in shares) == 9
+    np.testing.assert_array_equal(np.concatenate([updated for _, updated in shares]), np.full(10, 2.0))
+
+
+def test_groups_are_found_by_name():
     groups = [Group(name, name, lambda size: None) for name in ("one", "two")]
     assert [group.name for group in chosen(groups, ["two"])] == ["two"]
     assert chosen(groups, None) == groups

@@ -42,6 +42,7 @@ def integrate(size: str) -> Case:
             "Open3D voxel grid, occupancy only",
             lambda: peers.open3d_voxels(_kept(scene), VOXEL_M["medium"][0]),
             1.0,
+            size == "medium",
             modules=("open3d",),
         )
     ]
@@ -73,7 +74,7 @@ def fuse(size: str) -> Case:
         octomap("OctoMap, ray casting", RAY_LIMIT, discretize=False),
         octomap("OctoMap, discretised", DISCRETE_LIMIT, discretize=True),
         Peer(
-            "of which its binding's conversion",
+            "OctoMap's Python binding alone",
             lambda: peers.octomap_binding(len(points), edge_m),
             modules=("octomap",),
         ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,12 +17,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 OWN = "jaxmap"
-WIDTH_PX, HEIGHT_PX, DPI = 1040, 660, 200
+WIDTH_PX, HEIGHT_PX, DPI = 1040, 660, 236
 _OWN_INK: Rgb = (178, 60, 46)
 _PEER_INKS: tuple[Rgb, ...] = ((72, 98, 130), (150, 116, 52), (86, 128, 100), (126, 86, 130))
 _GRID = "#e4e1d9"
-_LABEL_GAP = 0.062
-_LABEL_LETTERS = 25
+_LABEL_GAP = 0.068
+_LABEL_LETTERS = 23
 
 
 class Line(NamedTuple):
@@ -71,7 +72,7 @@ def growth_picture(growth: Growth) -> bytes:
     from matplotlib.figure import Figure
 
     figure = Figure((WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI, facecolor="white")
-    axes = figure.add_axes((0.105, 0.165, 0.60, 0.74))
+    axes = figure.add_axes((0.115, 0.175, 0.585, 0.72))
     for line, ink in zip(growth.lines, _inks(len(growth.lines)), strict=True):
         _draw_line(axes, line, ink)
     if not growth.flat:
@@ -140,39 +141,30 @@ def _scale(axes: Axes, growth: Growth) -> None:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten; 2 and 5 times them too where there are few."""
+    """Powers of ten; some between them where there are few."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    factors = (1, 2, 5) if math.log10(high / low) < 2.2 else (1,)
+    decades = math.log10(high / low)
+    factors = (1, 1.5, 2, 3, 5, 7) if decades < 1 else (1, 2, 5) if decades < 2.2 else (1,)
     return [tick for power in powers for factor in factors if low <= (tick := factor * 10.0**power) <= high]
 
 
 def _label_ends(axes: Axes, lines: Sequence[Line]) -> None:
-    """Names to the right of the lines' ends, moved apart."""
+    """Names to the right of the lines' ends, moved apart; that of a lone point stands beside it."""
     to_axes = (axes.transData + axes.transAxes.inverted()).transform
     inks = dict(zip((line.name for line in lines), _inks(len(lines)), strict=True))
-    heights = {line.name: float(to_axes((line.sizes[-1], line.times_ms[-1]))[1]) for line in lines}
-    names = sorted(heights, key=lambda name: heights[name])
-    rows = [_wrapped(name) for name in names]
-    # A name of two rows takes the room of two.
-    room = max(map(len, rows), default=1)
-    for name, parts, place in zip(
-        names, rows, spread(sorted(heights.values()), room * _LABEL_GAP, 0.0, 1.0), strict=True
-    ):
-        axes.text(
-            *(1.03, place, "\n".join(parts)),
-            transform=axes.transAxes,
-            color=inks[name],
-            size=6.6,
-            weight="bold" if name == OWN else "normal",
-            va="center",
-            linespacing=1.05,
-        )
-
-
-def _wrapped(name: str) -> list[str]:
-    import textwrap
-
-    return textwrap.wrap(name, _LABEL_LETTERS)
+    style = {"transform": axes.transAxes, "size": 6.4, "va": "center", "linespacing": 1.05}
+    ends = {line.name: to_axes((line.sizes[-1], line.times_ms[-1])) for line in lines}
+    for line in lines:
+        if len(line.sizes) == 1:
+            x, y = ends.pop(line.name)
+            axes.text(x + 0.03, y, line.name, color=inks[line.name], **style)
+    names = sorted(ends, key=lambda name: ends[name][1])
+    rows = [textwrap.wrap(name, _LABEL_LETTERS) for name in names]
+    # A name of several rows takes the room of as many.
+    room = max(map(len, rows), default=1) * _LABEL_GAP
+    for name, parts, place in zip(names, rows, spread([ends[name][1] for name in names], room, 0.0, 1.0), strict=True):
+        weight = "bold" if name == OWN else "normal"
+        axes.text(1.03, place, "\n".join(parts), color=inks[name], weight=weight, **style)
 
 
 def _dress(axes: Axes, growth: Growth) -> None:

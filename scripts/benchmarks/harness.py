@@ -35,7 +35,8 @@ class Peer(NamedTuple):
         name: as it is printed.
         make: prepares it; what it returns is timed. Called only where `modules` are installed.
         limit: the greatest ratio, our time over its time, that is good enough; None where no target is set.
-        gated: whether the run fails where the limit is passed; otherwise the target is only printed.
+        gated: whether the run fails where the limit is passed; otherwise the target is only printed, as at sizes that
+            it was not set for.
         modules: what must be importable.
     """
 

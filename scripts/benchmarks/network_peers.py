@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import sys
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
@@ -68,6 +69,8 @@ class NetworkPeers:
 
     def openvino_request(self) -> Run:
         """OpenVINO, in float32."""
+        # It would report its import over the network, from a fork; without the package that does so, it does not.
+        sys.modules.setdefault("openvino_telemetry", None)  # pyright: ignore[reportArgumentType]
         import openvino
 
         core = openvino.Core()

@@ -193,7 +193,8 @@ def network_model() -> SavedModel:
     with tempfile.TemporaryDirectory() as folder:
         save_file(seeded_state_of(BACKBONE), Path(folder) / "smp.safetensors")
         imported = import_weights(Path(folder) / "smp.safetensors")
-    return SavedModel(imported.architecture, imported.weights, imported.holds)
+    weights = {name: jnp.asarray(value) for name, value in imported.weights.items()}
+    return SavedModel(imported.architecture, weights, imported.holds)
 
 
 @cache

@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.gate import Verdict
 from benchmarks.growth import growth_of, growth_picture
-from benchmarks.wording import count_text, rate_text, short, speed_text, time_text
+from benchmarks.wording import count_text, rate_text, short, short_speed, speed_text, time_text
 from jaxmap.report.page import page
 
 Case = Mapping[str, Any]
@@ -62,8 +62,7 @@ def _speed(cases: Mapping[str, Case], name: str, peer: str) -> str:
     """How fast a case is beside the peer whose name begins so; empty where it was not measured."""
     for beside, figures in cases.get(name, {}).get("peers", {}).items():
         if beside.startswith(peer):
-            ratio = figures["ratio"]
-            return f"{short(1 / ratio)} ×" if ratio <= 0.5 else f"{100 / ratio:.0f} %"
+            return short_speed(figures["ratio"])
     return ""
 
 
@@ -76,22 +75,22 @@ def _targets(cases: Mapping[str, Case], found: Sequence[Verdict]) -> str:
                 continue
             met = beside["ratio"] <= beside["limit"]
             verdict = bounds.get((name, peer))
-            gate = "told only" if verdict is None else f"{verdict.bound:.3g}"
+            ratio = f"{beside['ratio']:.3g}" + (f" of {verdict.bound:.3g}" if verdict is not None else "")
             rows += (
                 f'<tr><th scope="row">{escape(name)}</th><td class="text">{escape(peer)}</td>'
                 f"<td>{time_text(case['median_ms'])}</td><td>{time_text(beside['median_ms'])}</td>"
-                f"<td>{speed_text(beside['ratio'])}</td><td>{speed_text(beside['limit'])}</td>"
+                f"<td>{short_speed(beside['ratio'])}</td><td>{short_speed(beside['limit'])}</td>"
                 f"<td{'' if met else ' class=missed'}>{'met' if met else 'not met'}</td>"
-                f"<td>{beside['ratio']:.3g}</td><td>{gate}</td></tr>"
+                f"<td{' class=missed' if verdict and not verdict.passed else ''}>{ratio}</td></tr>"
             )
     if not rows:
         return ""
-    names = ("", "beside", "jaxmap", "the other", "jaxmap is", "target", "", "ratio", "gate")
+    names = ("", "beside", "jaxmap", "the other", "speed", "target", "", "ratio, gate")
     head = "".join(f'<th scope="col"{" class=text" if name == "beside" else ""}>{name}</th>' for name in names)
     return (
         f'<section><h2>Targets</h2><div class="figures"><figure><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></figure></div><p>A ratio is jaxmap's time over the other's; a gate is the "
-        "ratio that fails the run. Where there is no gate, the target is only told.</p></section>"
+        f"<tbody>{rows}</tbody></table></figure></div><p>Speed is jaxmap's beside the other's, a ratio jaxmap's time "
+        "over the other's. A gate is the ratio that fails the run; without one, the target is only told.</p></section>"
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from benchmarks.harness import Peer, Run
 from benchmarks.scene import DISPARITIES, Scene
@@ -87,7 +88,7 @@ def open3d_voxels(points_world: np.ndarray, voxel_size_m: float) -> Run:
 class PlaneFit:
     """A fit of a plane, and the planes (4,) `normal . p + offset = 0` that it has found so far."""
 
-    fit: Callable[[], Sequence[float]]
+    fit: Callable[[], ArrayLike]
     planes: list[np.ndarray] = field(default_factory=list)
 
     def __call__(self) -> None:
@@ -150,13 +151,18 @@ def opencv_points(scene: Scene) -> Run:
     return lambda: cv2.transform(cv2.reprojectImageTo3D(disparity_px, Q), T)
 
 
-def memory_pass(read: Sequence[np.ndarray], updated_floats: int, threads: int | None = None) -> Run:
+def memory_pass(
+    read: Sequence[np.ndarray], updated_floats: int, threads: int | None = None
+) -> Callable[[], list[tuple[int, np.ndarray]]]:
     """Reads arrays and reads and writes so many float32, once, on all threads: no program that does so is faster.
 
     Args:
         read: what is read; its greatest number is looked for, as that needs no more than reading.
         updated_floats: numbers that are read and written.
         threads: by default as many as the process may use.
+
+    Returns:
+        What does so once; it gives for each thread the greatest number (of the bits of floats), and what it updated.
     """
     threads = threads or usable_cores()
     flat = [array.reshape(-1).view(np.int32 if array.itemsize == 4 else np.int8) for array in read]
@@ -165,9 +171,8 @@ def memory_pass(read: Sequence[np.ndarray], updated_floats: int, threads: int | 
     updated = np.array_split(target, threads)
     pool = ThreadPoolExecutor(threads)
 
-    def work(index: int) -> None:
-        for part in shares[index]:
-            part.max(initial=0)
-        np.add(updated[index], 1.0, out=updated[index])
+    def work(index: int) -> tuple[int, np.ndarray]:
+        greatest = max((int(part.max(initial=0)) for part in shares[index]), default=0)
+        return greatest, np.add(updated[index], 1.0, out=updated[index])
 
     return lambda: list(pool.map(work, range(threads)))

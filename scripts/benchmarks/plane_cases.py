@@ -51,7 +51,7 @@ def mlesac(size: str) -> Case:
             fits[name] = make()
             return fits[name]
 
-        return Peer(name, kept, limit, modules=(module,))
+        return Peer(name, kept, limit, size == "medium", modules=(module,))
 
     def facts() -> Mapping[str, float]:
         errors = {

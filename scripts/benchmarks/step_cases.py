@@ -13,7 +13,7 @@ from benchmarks.scene import grid_of, make_scene
 
 FUSED_BEFORE = {"small": 50, "medium": 500, "large": 2000}
 STEP_LIMIT = 0.25
-FLAT_LIMIT = 1.15
+FLAT_LIMIT = 1.25
 
 
 def step(labeller: str, size: str) -> Case:
@@ -24,7 +24,7 @@ def step(labeller: str, size: str) -> Case:
     if labeller == "deeplab":
         beside = Peer("the network alone", lambda: ours.label_pixels(scene, ours.NETWORK_PX).run, 1.5, size == "medium")
     else:
-        beside = beside._replace(limit=STEP_LIMIT, gated=size != "large")
+        beside = beside._replace(limit=STEP_LIMIT, gated=size == "medium")
     return Case(
         prepared,
         Amount(int(np.prod(grid_of(size).shape)), "voxels"),
@@ -44,7 +44,7 @@ def fused_before(size: str) -> Case:
         prepared,
         Amount(FUSED_BEFORE[size], "frames fused before"),
         Amount(1, "frames"),
-        [Peer("the same step, map empty at first", prepared.afresh, FLAT_LIMIT)],
+        [Peer("the same step, map empty at first", prepared.afresh, FLAT_LIMIT, size == "large")],
     )
 
 

@@ -28,7 +28,7 @@ def rectify(size: str) -> Case:
     return Case(
         lambda: [rectify_image(image, maps) for image, maps in sides],
         *_pixels(scene),
-        peers=[Peer("OpenCV alone, float maps", lambda: _float_maps(scene, rig), limit=1.1)],
+        peers=[Peer("OpenCV alone, float maps", lambda: _float_maps(scene, rig), limit=1.1, gated=size == "medium")],
     )
 
 
@@ -71,7 +71,7 @@ def match(size: str) -> Case:
     return Case(
         lambda: matcher(scene.left, scene.right),
         *_pixels(scene),
-        peers=[peers.sgbm(scene)._replace(limit=1.5)],
+        peers=[peers.sgbm(scene)._replace(limit=1.5, gated=size == "medium")],
     )
 
 
@@ -79,7 +79,9 @@ def project(size: str) -> Case:
     """Disparity to points in the world."""
     scene = make_scene(size)
     prepared = ours.project(scene)
-    beside = [Peer("OpenCV, reprojectImageTo3D and transform", lambda: peers.opencv_points(scene), limit=1.0)]
+    beside = [
+        Peer("OpenCV, reprojectImageTo3D and transform", lambda: peers.opencv_points(scene), 1.0, size == "medium")
+    ]
     if size == "small":
         beside.append(Peer("NumPy twin", lambda: _twin(scene)))
     return Case(prepared.run, *_pixels(scene), beside, prepared.compile_s, prepared.temporary_bytes)

@@ -12,7 +12,7 @@ _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 def short(value: float) -> str:
     """Three digits: 0.123, 12.3, 1,230."""
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:.3g}"
 
 
 def time_text(milliseconds: float) -> str:
@@ -35,7 +35,12 @@ def rate_text(per_s: float, unit: str) -> str:
 
 def speed_text(ratio: float) -> str:
     """How fast we are beside a peer, from our time over its time."""
-    return f"{short(1 / ratio)} x as fast" if ratio <= 0.5 else f"{100 / ratio:.0f} % of its speed"
+    return f"{short(1 / ratio)} x as fast" if ratio <= 0.5 else f"{short_speed(ratio)} of its speed"
+
+
+def short_speed(ratio: float) -> str:
+    """The same in short: 50 x, 45 %."""
+    return f"{short(1 / ratio)} \N{MULTIPLICATION SIGN}" if ratio <= 0.5 else f"{short(100 / ratio)} %"
 
 
 def case_lines(name: str, figures: Mapping[str, Any], found: list[Verdict]) -> Iterator[str]:
@@ -43,9 +48,9 @@ def case_lines(name: str, figures: Mapping[str, Any], found: list[Verdict]) -> I
     by_peer = {verdict.peer: verdict for verdict in found if verdict.case == name}
     rate = rate_text(figures["work_per_s"], figures["work"]["unit"])
     yield f"{name} ({count_text(**figures['grown'])})"
-    yield f"    {'jaxmap':38s} {_timed(figures)}  {rate}"
+    yield f"    {'jaxmap':42s} {_timed(figures)}  {rate}"
     for peer, beside in figures["peers"].items():
-        line = f"    {peer:38s} {_timed(beside)}  we are {speed_text(beside['ratio'])} (ratio {beside['ratio']:.3g})"
+        line = f"    {peer:42s} {_timed(beside)}  we are {speed_text(beside['ratio'])} (ratio {beside['ratio']:.3g})"
         if "limit" in beside:
             line += f"; target {speed_text(beside['limit'])}"
             line += ", met" if beside["ratio"] <= beside["limit"] else ", NOT met"
@@ -53,7 +58,7 @@ def case_lines(name: str, figures: Mapping[str, Any], found: list[Verdict]) -> I
             line += f"; gate {verdict.bound:.3g} {'ok' if verdict.passed else 'TOO SLOW'}"
         yield line
     for peer, modules in figures["missing"].items():
-        yield f"    {peer:38s} left out: {', '.join(modules)} is not installed"
+        yield f"    {peer:42s} left out: {', '.join(modules)} is not installed"
     if "compile_s" in figures:
         memory = f"; {figures['temporary_mib']:.1f} MiB beside its data" if "temporary_mib" in figures else ""
         yield f"    compiled in {figures['compile_s']:.2f} s{memory}"
