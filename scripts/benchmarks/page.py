@@ -18,6 +18,7 @@ Case = Mapping[str, Any]
 _TITLE = "Beside the programs people would use instead"
 _HEADLINES = (
     ("sequence large", "SGBM 3WAY", "whole sequence, of SGBM's rate"),
+    ("sequence_fine large", "SGBM 3WAY", "the same, default voxels"),
     ("fuse medium", "OctoMap, ray casting", "fusion, beside OctoMap's rays"),
     ("fuse medium", "OctoMap, discretised", "beside OctoMap discretised"),
     ("mlesac medium", "Open3D segment_plane, 512", "MLESAC, beside Open3D"),
