@@ -91,7 +91,8 @@ def test_rounds_are_bounded():
 def test_the_median_lies_between_the_extremes(times_s: list[float]):
     told = summary(times_s)
     assert 0.999e3 * min(times_s) <= told["median_ms"] <= 1.001e3 * max(times_s)
-    assert 0 <= told["spread_ms"] <= 1.001e3 * (max(times_s) - min(times_s)) + 1e-12
+    # Differences of nearly equal numbers keep few digits.
+    assert 0 <= told["spread_ms"] <= 1.001e3 * (max(times_s) - min(times_s)) + 1e-9 * max(times_s)
 
 
 def test_a_peer_that_is_not_installed_is_left_out_and_named():

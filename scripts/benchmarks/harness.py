@@ -154,8 +154,8 @@ def timed(run: Run, clock: Clock = time.perf_counter) -> float:
 def summary(times_s: Sequence[float]) -> dict[str, float]:
     """The median and the spread (the distance of the quartiles), in milliseconds."""
     quartiles = statistics.quantiles(times_s, n=4, method="inclusive") if len(times_s) > 1 else [times_s[0]] * 3
-    low, median, high = (significant(1e3 * quartile) for quartile in quartiles)
-    return {"median_ms": median, "spread_ms": significant(high - low), "runs": len(times_s)}
+    low, median, high = (1e3 * quartile for quartile in quartiles)
+    return {"median_ms": significant(median), "spread_ms": significant(high - low), "runs": len(times_s)}
 
 
 def significant(value: float) -> float:
