@@ -15,30 +15,20 @@ The process keeps the memory it frees, as with `jaxmap train`; that helps all of
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
-import os
 import statistics
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks.harness import Run as Runner
+from benchmarks.harness import in_turn, timed
+from benchmarks.threads import limit_threads
 from jaxmap.host_memory import restart_with_lasting_memory
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZES = ((384, 512), (512, 512))
 BATCH, CROP = 8, (384, 384)
 RATE, DECAY = 1e-3, 1e-4
-Runner = Callable[[], object]
-
-
-def limit_threads(count: int) -> None:
-    """Must run before the libraries are loaded, which read it once."""
-    os.environ["OMP_NUM_THREADS"] = str(count)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
 
 
 def ours(state: dict, image) -> tuple[Runner, float]:
@@ -56,48 +46,6 @@ def ours(state: dict, image) -> tuple[Runner, float]:
     compiled = jax.jit(network.apply).lower(network.weights, image).compile()
     gflop = compiled.cost_analysis()["flops"] / 1e9
     return lambda: compiled(network.weights, image).block_until_ready(), gflop
-
-
-def peers(backbone: str, state: dict, image, threads: int) -> dict[str, Runner]:
-    """The peers that are installed; each takes the normalised image."""
-    try:
-        import torch
-    except ImportError:
-        return {}
-    from golden.make_smp_golden import MEAN, STD
-    from golden.torch_deeplab import DeepLabV3Plus
-
-    torch.set_num_threads(threads)
-    network = DeepLabV3Plus(backbone).eval()
-    network.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()})
-    scaled = (torch.from_numpy(image).float() / 255 - torch.tensor(MEAN)) / torch.tensor(STD)
-    inputs = scaled.permute(0, 3, 1, 2).contiguous()
-    last = network.to(memory_format=torch.channels_last)
-    inputs_last = inputs.to(memory_format=torch.channels_last)
-
-    def eager() -> object:
-        with torch.inference_mode():
-            return last(inputs_last)
-
-    runners: dict[str, Runner] = {"torch channels-last": eager}
-    with contextlib.suppress(ImportError):
-        import onnxruntime
-
-        content = io.BytesIO()
-        torch.onnx.export(network, (inputs,), content, input_names=["image"], output_names=["logits"], dynamo=False)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        session = onnxruntime.InferenceSession(content.getvalue(), options, providers=["CPUExecutionProvider"])
-        runners["onnxruntime"] = lambda: session.run(None, {"image": inputs.numpy()})
-        with contextlib.suppress(ImportError):
-            import openvino
-
-            core = openvino.Core()
-            model = core.read_model(io.BytesIO(content.getvalue()))
-            hints = {"INFERENCE_NUM_THREADS": threads, "INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
-            request = core.compile_model(model, "CPU", hints).create_infer_request()
-            runners["openvino f32"] = lambda: request.infer({"image": inputs.numpy()})
-    return runners
 
 
 def our_training(state: dict, images, labels) -> Runner:
@@ -181,8 +129,7 @@ def torch_training(backbone: str, state: dict, images, labels, threads: int) -> 
 def train(backbone: str, rounds: int, threads: int) -> None:
     """Prints the training case of a network."""
     import numpy as np
-    from golden.seeded_weights import seeded_image
-    from models.test_models_golden import seeded_state_of
+    from golden.seeded_weights import seeded_image, seeded_state_of
 
     state = seeded_state_of(backbone)
     images = np.stack([np.roll(seeded_image(*CROP), 16 * place, axis=0) for place in range(BATCH)])
@@ -201,13 +148,7 @@ def train(backbone: str, rounds: int, threads: int) -> None:
 
 def measured(runners: dict[str, Runner], rounds: int) -> dict[str, list[float]]:
     """Seconds of each call, turn by turn."""
-    times: dict[str, list[float]] = {name: [] for name in runners}
-    for _ in range(rounds):
-        for name, run in runners.items():
-            # Threads of the one before may still be spinning.
-            time.sleep(0.02)
-            times[name].append(timed(run))
-    return times
+    return dict(zip(runners, in_turn(list(runners.values()), [1] * len(runners), rounds), strict=True))
 
 
 def matmul_rate() -> float:
@@ -223,13 +164,6 @@ def matmul_rate() -> float:
     return 2e-9 * size**3 / min(times)
 
 
-def timed(run: Runner) -> float:
-    """Seconds of one call."""
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
-
-
 def main() -> None:
     """Prints a line for each network, size and runner."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -241,8 +175,9 @@ def main() -> None:
     restart_with_lasting_memory()
     limit_threads(arguments.threads)
     sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "golden")]
-    from golden.seeded_weights import seeded_image
-    from models.test_models_golden import seeded_state_of
+    from golden.seeded_weights import seeded_image, seeded_state_of
+
+    from benchmarks.network_peers import NetworkPeers
 
     print(f"{arguments.threads} threads, float32, median of {arguments.rounds} interleaved rounds")
     for backbone in arguments.backbones:
@@ -253,7 +188,8 @@ def main() -> None:
         for size in SIZES:
             image = seeded_image(*size)[None]
             own, gflop = ours(state, image)
-            runners = {"jaxmap": own, **peers(backbone, state, image, arguments.threads)}
+            peers = NetworkPeers(backbone, state, image, arguments.threads)
+            runners = {"jaxmap": own, **peers.installed()}
             for run in runners.values():
                 run()
             times = measured(runners, arguments.rounds)

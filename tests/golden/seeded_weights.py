@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import zlib
+from pathlib import Path
 
 import numpy as np
+
+GOLDEN = Path(__file__).with_name("smp_golden.npz")
 
 
 def _generator(name: str) -> np.random.Generator:
@@ -36,6 +40,13 @@ def seeded_tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
 def seeded_state(names: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     """A whole state dict."""
     return {name: seeded_tensor(name, shape) for name, shape in names.items()}
+
+
+def seeded_state_of(backbone: str) -> dict[str, np.ndarray]:
+    """A state dict of segmentation_models_pytorch's form with seeded weights."""
+    with np.load(GOLDEN) as golden:
+        lines = str(golden[f"names/{backbone}"]).splitlines()
+    return seeded_state({name: ast.literal_eval(shape) for name, _, shape in (line.partition(" ") for line in lines)})
 
 
 def seeded_image(height: int, width: int) -> np.ndarray:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from golden.seeded_weights import seeded_image, seeded_state
+from golden.seeded_weights import GOLDEN, seeded_image, seeded_state_of
 from safetensors.numpy import save_file
 
 from jaxmap.models.deeplab import inference_network
 from jaxmap.models.importers import import_weights
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "smp_golden.npz"
 STEP = 3
 QUICK = [("mobilenet_v2", 16, (64, 96)), ("resnet18", 16, (64, 96)), ("resnet50", 16, (64, 96))]
 ALL = [
@@ -23,14 +21,6 @@ ALL = [
     for stride in (16, 8)
     for size in ((64, 96), (96, 128))
 ]
-
-
-def seeded_state_of(backbone: str) -> dict[str, np.ndarray]:
-    """A state dict of segmentation_models_pytorch's form with seeded weights."""
-    with np.load(GOLDEN) as golden:
-        lines = str(golden[f"names/{backbone}"]).splitlines()
-    shapes = {name: tuple(ast.literal_eval(shape)) for name, _, shape in (line.partition(" ") for line in lines)}
-    return seeded_state(shapes)
 
 
 def seeded_checkpoint(backbone: str, path: Path) -> Path:

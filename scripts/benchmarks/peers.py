@@ -1,0 +1,178 @@
+"""The programs that people would use instead, each prepared on the same data; those of an extra are imported late."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from benchmarks.harness import Peer, Run
+from benchmarks.scene import DISPARITIES, Scene
+from benchmarks.threads import usable_cores
+
+SIGMA_M = 0.05
+"""Points as near to a plane are its inliers, for all."""
+
+
+def sgbm(scene: Scene, calls: int = 1) -> Peer:
+    """OpenCV's SGBM in its 3WAY mode with 128 disparities, on grey images, so many times in a row."""
+    times = "" if calls == 1 else f", {calls} times"
+
+    def make() -> Run:
+        block = 5
+        matcher = cv2.StereoSGBM.create(
+            numDisparities=DISPARITIES,
+            blockSize=block,
+            P1=8 * block**2,
+            P2=32 * block**2,
+            disp12MaxDiff=1,
+            preFilterCap=31,
+            uniquenessRatio=10,
+            speckleWindowSize=100,
+            speckleRange=2,
+            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )
+        grey = scene.grey
+
+        def run() -> None:
+            for _ in range(calls):
+                matcher.compute(*grey)
+
+        return run
+
+    return Peer(f"SGBM 3WAY, {DISPARITIES} disparities{times}", make)
+
+
+def octomap_insertion(
+    points_world: np.ndarray, origin_world: np.ndarray, resolution_m: float, *, discretize: bool, max_range_m: float
+) -> Run:
+    """OctoMap's `insertPointCloud` into a tree that goes on being filled."""
+    import octomap
+
+    tree = octomap.OcTree(resolution_m)
+    points, origin = points_world.astype(np.float64), origin_world.astype(np.float64)
+
+    def run() -> None:
+        tree.insertPointCloud(points, origin, maxrange=max_range_m, discretize=discretize)
+
+    return run
+
+
+def octomap_binding(count: int, resolution_m: float) -> Run:
+    """What OctoMap's binding takes to turn so many points into a C++ cloud: all lie in the voxel of the origin."""
+    origin = np.full(3, resolution_m / 2)
+    return octomap_insertion(np.tile(origin, (count, 1)), origin, resolution_m, discretize=True, max_range_m=-1.0)
+
+
+def open3d_cloud(points: np.ndarray) -> Any:
+    """A cloud of Open3D."""
+    import open3d
+
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+
+
+def open3d_voxels(points_world: np.ndarray, voxel_size_m: float) -> Run:
+    """Open3D's voxel grid of a cloud: which voxels hold points."""
+    import open3d
+
+    cloud = open3d_cloud(points_world)
+    return lambda: open3d.geometry.VoxelGrid.create_from_point_cloud(cloud, voxel_size_m)
+
+
+@dataclass
+class PlaneFit:
+    """A fit of a plane, and the planes (4,) `normal . p + offset = 0` that it has found so far."""
+
+    fit: Callable[[], ArrayLike]
+    planes: list[np.ndarray] = field(default_factory=list)
+
+    def __call__(self) -> None:
+        """Fits once more."""
+        self.planes.append(np.asarray(self.fit(), np.float64))
+
+
+def open3d_plane(points: np.ndarray, iterations: int, probability: float) -> PlaneFit:
+    """Open3D's `segment_plane`; with a probability of 1 it makes all iterations."""
+    cloud = open3d_cloud(points)
+    return PlaneFit(lambda: cloud.segment_plane(SIGMA_M, 3, iterations, probability)[0])
+
+
+class _PlaneModel:
+    """A plane as `skimage.measure.ransac` takes models: since 0.26 by `from_estimate`, before by `estimate`."""
+
+    @classmethod
+    def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
+        model = cls()
+        model.estimate(points)
+        return model
+
+    def estimate(self, points: np.ndarray) -> bool:
+        self.centre = points.mean(axis=0)
+        self.normal = np.linalg.svd(points - self.centre, full_matrices=False)[2][-1]
+        return True
+
+    def residuals(self, points: np.ndarray) -> np.ndarray:
+        return np.abs((points - self.centre) @ self.normal)
+
+
+def skimage_plane(points: np.ndarray, trials: int) -> PlaneFit:
+    """scikit-image's `ransac` with a plane, all trials made."""
+    from skimage.measure import ransac
+
+    random = np.random.default_rng(0)
+
+    def fit() -> np.ndarray:
+        model, _ = ransac(points, _PlaneModel, 3, SIGMA_M, max_trials=trials, stop_probability=1.0, rng=random)
+        return np.append(model.normal, -model.normal @ model.centre)
+
+    return PlaneFit(fit)
+
+
+def opencv_points(scene: Scene) -> Run:
+    """OpenCV's `reprojectImageTo3D` and `transform`: disparity to points in the world."""
+    camera = scene.camera
+    fx, fy, cx, cy = (float(getattr(camera, name)) for name in ("fx_px", "fy_px", "cx_px", "cy_px"))
+    baseline_m, doffs_px = float(camera.baseline_m), float(camera.doffs_px)
+    # (X, Y, Z, W) = Q (u, v, d, 1) with W = (d + doffs) / (b fx).
+    Q = np.array(
+        [
+            [1, 0, 0, -cx],
+            [0, fx / fy, 0, -cy * fx / fy],
+            [0, 0, 0, fx],
+            [0, 0, 1 / baseline_m, doffs_px / baseline_m],
+        ]
+    )
+    disparity_px, T = scene.disparity_px, scene.T_world_camera[:3].astype(np.float32)
+    return lambda: cv2.transform(cv2.reprojectImageTo3D(disparity_px, Q), T)
+
+
+def memory_pass(
+    read: Sequence[np.ndarray], updated_floats: int, threads: int | None = None
+) -> Callable[[], list[tuple[int, np.ndarray]]]:
+    """Reads arrays and reads and writes so many float32, once, on all threads: no program that does so is faster.
+
+    Args:
+        read: what is read; its greatest number is looked for, as that needs no more than reading.
+        updated_floats: numbers that are read and written.
+        threads: by default as many as the process may use.
+
+    Returns:
+        What does so once; it gives for each thread the greatest number (of the bits of floats), and what it updated.
+    """
+    threads = threads or usable_cores()
+    flat = [array.reshape(-1).view(np.int32 if array.itemsize == 4 else np.int8) for array in read]
+    target = np.zeros(updated_floats, np.float32)
+    shares = [[part[index] for part in (np.array_split(array, threads) for array in flat)] for index in range(threads)]
+    updated = np.array_split(target, threads)
+    pool = ThreadPoolExecutor(threads)
+
+    def work(index: int) -> tuple[int, np.ndarray]:
+        greatest = max((int(part.max(initial=0)) for part in shares[index]), default=0)
+        return greatest, np.add(updated[index], 1.0, out=updated[index])
+
+    return lambda: list(pool.map(work, range(threads)))
