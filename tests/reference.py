@@ -230,9 +230,17 @@ def plane_cost(residuals, sigma_m: float, nu_m: float, rounds: int, cost: str) -
     return float(-np.log(gamma * density + (1 - gamma) / nu_m).sum())
 
 
-def fit_plane(sample, triples, up, *, sigma_m, nu_m, rounds, cost, max_tilt_rad):
-    """The best plane through any of the triples, then refitted: normal, offset and share of inliers."""
-    sample, up = f64(sample), f64(up)
+def least_squares_plane(points, weights, up) -> tuple[np.ndarray, float]:
+    mean = weights @ points / weights.sum()
+    spread = (points - mean) * np.sqrt(weights)[:, None]
+    normal = np.linalg.svd(spread, full_matrices=False)[2][-1]
+    normal = normal * (1 if normal @ up >= 0 else -1)
+    return normal, float(-normal @ mean)
+
+
+def fit_plane(sample, triples, every, up, *, sigma_m, nu_m, rounds, cost, max_tilt_rad):
+    """The best plane through any triple, refitted to the sample, then to all points: normal, offset, share of inliers."""
+    sample, every, up = f64(sample), f64(every), f64(up)
     best = (np.inf, up, 0.0)
     for a, b, c in sample[np.asarray(triples)]:
         normal = np.cross(b - a, c - a)
@@ -247,11 +255,10 @@ def fit_plane(sample, triples, up, *, sigma_m, nu_m, rounds, cost, max_tilt_rad)
     share = 0.0
     for _ in range(5):
         share, _, weights = inlier_share(sample @ normal + offset, sigma_m, nu_m, rounds)
-        mean = weights @ sample / weights.sum()
-        spread = (sample - mean) * np.sqrt(weights)[:, None]
-        normal = np.linalg.svd(spread, full_matrices=False)[2][-1]
-        normal = normal * (1 if normal @ up >= 0 else -1)
-        offset = -normal @ mean
+        normal, offset = least_squares_plane(sample, weights, up)
+    for _ in range(2):
+        _, density, _ = inlier_share(every @ normal + offset, sigma_m, nu_m, 0)
+        normal, offset = least_squares_plane(every, share * density / (share * density + (1 - share) / nu_m), up)
     return normal, offset, share
 
 

@@ -168,11 +168,31 @@ def test_the_whole_fit_equals_the_twin_given_its_draws(rng, cost, seed):
     triples = jax.random.randint(triple_key, (OPTIONS["hypotheses"], 3), 0, OPTIONS["sample_points"])
     mixture = dict(sigma_m=OPTIONS["sigma_m"], nu_m=OPTIONS["outlier_range_m"], rounds=OPTIONS["em_rounds"])
     normal, offset_m, share = reference.fit_plane(
-        sample, triples, UP, cost=cost, max_tilt_rad=OPTIONS["max_tilt_rad"], **mixture
+        sample, triples, points[valid], UP, cost=cost, max_tilt_rad=OPTIONS["max_tilt_rad"], **mixture
     )
     np.testing.assert_allclose(plane.normal, normal, atol=1e-3)
     np.testing.assert_allclose(plane.offset_m, offset_m, atol=3e-3)
     np.testing.assert_allclose(plane.inlier_fraction, share, atol=1e-2)
+
+
+@given(rngs())
+def test_the_plane_is_that_of_all_points_and_not_of_the_few_that_were_drawn(rng):
+    points, normal, offset_m = plane_points(rng, noise_m=0.02, outliers=0.4)
+    inliers = np.abs(points @ normal + offset_m) < 0.1
+    by_all, offset_by_all_m = reference.least_squares_plane(points, inliers.astype(float), np.asarray(UP))
+    planes = [
+        fit_plane_mlesac(
+            jax.random.key(seed),
+            jnp.asarray(points),
+            jnp.ones(CLOUD, bool),
+            up_hint=UP,
+            **OPTIONS | {"sample_points": 40},
+        )
+        for seed in range(3)
+    ]
+    for plane in planes:
+        np.testing.assert_allclose(plane.normal, by_all, atol=6e-4)
+        np.testing.assert_allclose(plane.offset_m, offset_by_all_m, atol=1.5e-3)
 
 
 @given(rngs(), st.sampled_from(COSTS))

@@ -15,6 +15,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from jaxmap.types import Plane
 
 _REFIT_ROUNDS = 5
+_POLISH_ROUNDS = 2
+_POLISH_POINTS = 1 << 16
+"""The few points that judge hypotheses bound how near their plane can come; the last rounds take so many."""
 _BLOCK = 16
 _NORMALISER = 2.5066282746  # sqrt(2 pi)
 
@@ -38,8 +41,8 @@ def fit_plane_mlesac(
     A residual r is drawn from `gamma N(0, sigma) + (1 - gamma) / nu` (the mixture of the paper
     above), gamma by expectation maximisation for each hypothesis; the hypothesis with the least
     negative log-likelihood wins and is refitted by least squares weighted with the inliers'
-    posteriors. `cost="msac"` scores hypotheses by `min(r^2, (1.96 sigma)^2)` instead, which is what
-    PCL and MATLAB's `pcfitplane` run.
+    posteriors, at last on points spread evenly over the whole list. `cost="msac"` scores hypotheses
+    by `min(r^2, (1.96 sigma)^2)` instead, which is what PCL and MATLAB's `pcfitplane` run.
 
     Args:
         key: the randomness of the hypotheses; the same key gives the same plane.
@@ -83,9 +86,14 @@ def fit_plane_mlesac(
 
 
 class PlaneStart(NamedTuple):
-    """The best hypothesis and the points that judged it, relative to their `centre_m`."""
+    """The best hypothesis, the points that judged it, and more for its refit (real where `spread_valid`).
+
+    All positions are relative to `centre_m`.
+    """
 
     sample: Float[Array, "S 3"]
+    spread: Float[Array, "L 3"]
+    spread_valid: Bool[Array, "L"]
     centre_m: Float[Array, "3"]
     normal: Float[Array, "3"]
     offset_m: Float[Array, ""]
@@ -129,7 +137,10 @@ def search_plane(
     best = jnp.argmin(costs)
     # Which hypothesis wins is a choice, and those through one point twice have no gradient: the refit has.
     normal, offset = jax.lax.stop_gradient((normals[best], offsets[best]))
-    return PlaneStart(sample, centre, normal, offset, acceptable[best] & enough)
+    every = max(1, -(-points.shape[0] // _POLISH_POINTS))
+    spread_valid = valid[::every]
+    spread = jnp.where(spread_valid[:, None], points[::every] - centre, 0.0)
+    return PlaneStart(sample, spread, spread_valid, centre, normal, offset, acceptable[best] & enough)
 
 
 def refit_plane(
@@ -145,8 +156,13 @@ def refit_plane(
     mixture = (sigma_m, outlier_range_m, em_rounds)
     # Points all alike, as where nothing is valid, have a spread without directions: its eigenvectors have no gradient.
     sample = jnp.where(start.found, start.sample, _spread_points(start.sample.shape[0]))
+    more = jnp.where(start.found, start.spread, _spread_points(start.spread.shape[0]))
     first = jnp.where(start.found, start.normal, up_hint)
     normal, offset, inliers = _refit(sample, first, jnp.where(start.found, start.offset_m, 0.0), up_hint, mixture)
+    for _ in range(_POLISH_ROUNDS):
+        density = _inlier_density(more @ normal + offset, sigma_m)
+        weights = _posterior(density, inliers, outlier_range_m) * (start.spread_valid | ~start.found)
+        normal, offset = _least_squares(more, weights, up_hint)
     # Points of a wall may turn the refitted plane over; the hypothesis is acceptable as it is.
     upright = normal @ up_hint >= jnp.cos(max_tilt_rad)
     normal = jnp.where(upright, normal, start.normal)
@@ -235,11 +251,15 @@ def _refit(
     for _ in range(_REFIT_ROUNDS):
         density = _inlier_density(sample @ normal + offset, sigma_m)
         gamma = _mixing(density, nu_m, em_rounds)
-        weights = _posterior(density, gamma, nu_m)
-        total = jnp.maximum(weights.sum(), 1e-9)
-        mean = weights @ sample / total
-        spread = sample - mean
-        _, vectors = jnp.linalg.eigh((weights[:, None] * spread).T @ spread / total)
-        normal = vectors[:, 0] * jnp.where(vectors[:, 0] @ up_hint < 0, -1.0, 1.0)
-        offset = -normal @ mean
+        normal, offset = _least_squares(sample, _posterior(density, gamma, nu_m), up_hint)
     return normal, offset, gamma
+
+
+def _least_squares(points: Array, weights: Array, up_hint: Array) -> tuple[Array, Array]:
+    """The plane with the least weighted sum of squared distances, its normal turned to the side of the up hint."""
+    total = jnp.maximum(weights.sum(), 1e-9)
+    mean = weights @ points / total
+    spread = points - mean
+    _, vectors = jnp.linalg.eigh((weights[:, None] * spread).T @ spread / total)
+    normal = vectors[:, 0] * jnp.where(vectors[:, 0] @ up_hint < 0, -1.0, 1.0)
+    return normal, -normal @ mean
