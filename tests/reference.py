@@ -239,7 +239,7 @@ def least_squares_plane(points, weights, up) -> tuple[np.ndarray, float]:
 
 
 def fit_plane(sample, triples, every, up, *, sigma_m, nu_m, rounds, cost, max_tilt_rad):
-    """The best plane through any triple, refitted to the sample, then to all points: normal, offset, share of inliers."""
+    """The best plane through any triple, refitted to the sample, then to all points; also the share of inliers."""
     sample, every, up = f64(sample), f64(every), f64(up)
     best = (np.inf, up, 0.0)
     for a, b, c in sample[np.asarray(triples)]:
