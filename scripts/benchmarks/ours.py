@@ -142,7 +142,7 @@ def fit_plane(points: np.ndarray, hypotheses: int) -> tuple[Callable[[], np.ndar
 def window_of(scene: Scene, size: str) -> GridSpec:
     """The part of the grid that the scene's frame can touch."""
     grid = grid_of(size)
-    shape = window_shape(grid, scene.camera, DEPTH_RANGE_M[1])
+    shape = window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1))
     return view_window(grid, scene.camera, scene.pose, DEPTH_RANGE_M[1], shape).grid
 
 
@@ -173,7 +173,7 @@ def fuse_frame(scene: Scene, size: str) -> Prepared:
     """Carving and integration of one frame, as the step does them; the result is the map's tensor."""
     points, params, grid = points_of(scene), make_fusion_params(ROVER_CLASSES), grid_of(size)
     empty = make_voxel_map(grid, ROVER_CLASSES)
-    reach = Reach(DEPTH_RANGE_M, window_shape(grid, scene.camera, DEPTH_RANGE_M[1]))
+    reach = Reach(DEPTH_RANGE_M, window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1)))
 
     def fuse(log_odds: jax.Array, rest: VoxelMap, points: tuple[Any, ...], pose: jaxlie.SE3) -> jax.Array:
         voxel_map, (points_world, labels, depth_m, valid) = replace(rest, log_odds=log_odds), points
@@ -219,8 +219,10 @@ def label_pixels(scene: Scene, size_px: tuple[int, int]) -> Prepared:
 
 
 def mapper_of(scene: Scene, labeller: Labeller, size: str) -> tuple[Mapper, MapperParams]:
-    """A mapper with the default numbers."""
-    mapper = make_mapper(scene.camera, grid_of(size), labeller, RULE, DEPTH_RANGE_M)
+    """A mapper with the default numbers, for a drive along which the camera is never turned (`moved_poses`)."""
+    mapper = make_mapper(
+        scene.camera, grid_of(size), labeller, RULE, DEPTH_RANGE_M, T_world_camera=moved_poses(scene, 1)
+    )
     return mapper, MapperParams(scene.camera, make_fusion_params(labeller.classes), labeller.params)
 
 

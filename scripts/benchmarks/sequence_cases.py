@@ -11,7 +11,7 @@ from benchmarks.groups import Group
 from benchmarks.harness import Amount, Case
 from benchmarks.scene import make_scene, write_sequence
 
-FRAMES = {"small": 6, "medium": 12, "large": 24}
+FRAMES = {"small": 8, "medium": 24, "large": 72}
 RATE_SHARE = 0.45
 """Of the rate of SGBM alone on the same cores."""
 
