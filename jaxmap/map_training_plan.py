@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from jaxmap.config import MapConfig
 from jaxmap.datasets.crs import Extent, read_crs
-from jaxmap.datasets.label_coding import DEFAULT_CODING, LabelCoding, parse_coding
+from jaxmap.datasets.label_coding import choose_coding
 from jaxmap.datasets.orthomosaic import read_label_orthomosaic
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.files import bundled
@@ -130,7 +130,7 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
     """
     options, path = config.map_truth, config.ground_truth
     assert path is not None
-    coding: LabelCoding = DEFAULT_CODING if options.remap is None else parse_coding(options.remap, "map_truth.remap")
+    coding = choose_coding(options.remap or (), None, "map_truth.remap")
     named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
     shown = [index for index, name in enumerate(config.classes) if name in named]
     if len(shown) < 2:

@@ -64,15 +64,13 @@ def main(words: Sequence[str]) -> int:
     arguments = parse(EvaluateArguments, "evaluate", words)
     if not arguments.ground_truth:
         raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
-    if arguments.remap and arguments.palette is not None:
-        raise UsageError("--remap and --palette exclude each other", fix="give one of them")
     if arguments.out is not None and arguments.out.suffix.lower() != ".json":
         raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
     if min(arguments.rock_diameters_m) <= 0:
         raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
 
     from jaxmap.cache import keep_compiled_programs
-    from jaxmap.datasets.label_coding import DEFAULT_CODING, parse_coding, read_coding
+    from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.datasets.rock_list import SIZE_CLASSES
     from jaxmap.evaluation.evaluate import ScoringOptions
     from jaxmap.map_evaluation import TruthOptions, evaluate_run, summary, write_evaluation
@@ -80,16 +78,13 @@ def main(words: Sequence[str]) -> int:
 
     keep_compiled_programs()
     console = Console()
-    coding = DEFAULT_CODING
-    if arguments.remap:
-        coding = parse_coding(arguments.remap)
-    elif arguments.palette is not None:
-        coding = read_coding(arguments.palette)
     diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
     evaluation, class_map = evaluate_run(
         arguments.run,
         arguments.ground_truth,
-        TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m),
+        TruthOptions(
+            arguments.target, choose_coding(arguments.remap, arguments.palette), arguments.truth_crs, diameters_m
+        ),
         ScoringOptions(
             cell_size_m=arguments.cell_size_m,
             rock_fraction=arguments.rock_fraction,

@@ -77,7 +77,7 @@ def main(words: Sequence[str]) -> int:
     _check(arguments, config)
 
     from jaxmap.cache import keep_compiled_programs
-    from jaxmap.datasets.label_coding import DEFAULT_CODING, parse_coding, read_coding
+    from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.map_evaluation import TruthOptions
     from jaxmap.tuning.descent import DescentOptions
     from jaxmap.tuning.map_loss import LossOptions
@@ -86,11 +86,6 @@ def main(words: Sequence[str]) -> int:
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
-    coding = DEFAULT_CODING
-    if arguments.remap:
-        coding = parse_coding(arguments.remap)
-    elif arguments.palette is not None:
-        coding = read_coding(arguments.palette)
     count = len(arguments.sequence)
     rows = zip(
         arguments.sequence,
@@ -111,7 +106,7 @@ def main(words: Sequence[str]) -> int:
     run = TuningRun(
         [Source(*row) for row in rows],
         config,
-        TruthOptions(arguments.target, coding, arguments.truth_crs),
+        TruthOptions(arguments.target, choose_coding(arguments.remap, arguments.palette), arguments.truth_crs),
         options,
         arguments.out,
         tell=console.tell,
@@ -143,8 +138,6 @@ def _check(arguments: TuneArguments, config: MapConfig) -> None:
             )
     if arguments.out.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError(f"--out {arguments.out} is not a .yaml file", fix="name a YAML file")
-    if arguments.remap and arguments.palette is not None:
-        raise UsageError("--remap and --palette exclude each other", fix="give one of them")
     inputs = (config.poses, config.calibration, arguments.palette, *arguments.poses_of)
     if arguments.out.resolve() in {path.resolve() for path in inputs if path is not None}:
         raise UsageError("an input would be overwritten", where=arguments.out, fix="choose another --out")
