@@ -14,7 +14,7 @@ from jaxmap.config import MapConfig
 from jaxmap.datasets.crs import Extent, read_crs
 from jaxmap.datasets.label_coding import choose_coding
 from jaxmap.datasets.orthomosaic import read_label_orthomosaic
-from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.errors import JaxmapError, UsageError, options_as, with_options
 from jaxmap.files import bundled
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import exact_corner
@@ -27,7 +27,7 @@ from jaxmap.sequence import prepare_frames
 from jaxmap.training.batches import Order
 from jaxmap.training.losses import class_weights
 from jaxmap.training.starts import make_start
-from jaxmap.training_config import TrainConfig
+from jaxmap.training_config import TrainConfig, option_here
 from jaxmap.training_plan import TrainingPlan, check_scale, told_start
 from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth
 from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
@@ -65,9 +65,10 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, te
             fix="train it on images first, and leave --classes, network and norm as they are there",
         )
     mapping = replace(config.mapping, labeller="deeplab", model=path, classes=config.classes)
-    plan = plan_run(source, mapping, tell)
-    truth, truths = read_cells(plan, config)
-    frames = keep_frames(plan, truth, saved, config.map_truth.anchor, tell)
+    with options_as(option_here):
+        plan = plan_run(source, mapping, lambda line: tell(with_options(line, option_here)))
+        truth, truths = read_cells(plan, config)
+        frames = keep_frames(plan, truth, saved, config.map_truth.anchor, tell)
     train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
     data = MapData(plan, truth, train, validation, config.ground_truth.name)
     counts = class_pixels(train, len(config.classes))
@@ -101,7 +102,7 @@ def _check(config: TrainConfig) -> None:
             "loss.lovasz and loss.label_smoothing are of pixels", where="--supervision map", fix="leave them out"
         )
     if not (losses.cross_entropy or losses.soft_iou):
-        raise UsageError("every loss has a weight of 0", where="--loss", fix="give one of them a weight")
+        raise UsageError("every loss has a weight of 0", where="loss", fix="give one of them a weight")
     if config.augmentation.copies is not None:
         raise UsageError("augmentation.copies is for images", where="--supervision map", fix="leave it out")
     if jax.local_device_count() > 1:

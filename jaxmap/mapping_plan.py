@@ -264,7 +264,7 @@ def _told_network(model: ModelFile, network: SavedModel, classes: Sequence[str])
     count = len(network.architecture.classes)
     return (
         f"labels by {model.path.name} ({network.architecture.backbone}, {count} classes), "
-        f"mapped as {shortened(classes)}; --classes and --deeplab.class-map choose"
+        f"mapped as {shortened(classes)}; the settings classes and deeplab.class_map choose"
     )
 
 

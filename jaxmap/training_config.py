@@ -73,6 +73,16 @@ class TrainConfig(TrainingOptions):
     """How the sequence is read and mapped, with map supervision: as the settings of jaxmap map."""
 
 
+_OTHERWISE = {"--remap": "--map-truth.remap", "--truth-crs": "--map-truth.crs", "--classes": "--classes"}
+
+
+def option_here(option: str) -> str:
+    """What `jaxmap train` calls an option of `jaxmap map` or `jaxmap evaluate`; others as they are."""
+    name = option.removeprefix("--").partition(".")[0].replace("-", "_")
+    own = f"--mapping.{option.removeprefix('--')}" if name in MapConfig.__dataclass_fields__ else option
+    return _OTHERWISE.get(option, own)
+
+
 _SETTINGS = Settings(TrainConfig, "train", folder="train", given=("training_data", "init"))
 
 

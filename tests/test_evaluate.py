@@ -105,6 +105,13 @@ def test_a_real_run_is_scored_in_its_report(cli, finished_run, tmp_path):
     assert "scores.json could not be read" in (run / "report.html").read_text()
 
 
+def test_a_map_without_a_system_is_told_where_it_gets_one(cli, tmp_path):
+    rock = np.zeros((4, 4), bool)
+    run = write_map(tmp_path / "run", rock, ~rock, crs=None)
+    outcome = cli("evaluate", run, truth_file(tmp_path))
+    assert (outcome.status, "the map has no CRS, say it with jaxmap map --crs" in outcome.error) == (1, True)
+
+
 def test_the_error_map_shows_each_verdict_in_its_place(run, tmp_path):
     from jaxmap.evaluation.evaluate import ScoringOptions
     from jaxmap.map_evaluation import TruthOptions, evaluate_run

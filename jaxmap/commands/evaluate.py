@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.errors import JaxmapError, UsageError, options_as
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
 
 
@@ -79,20 +79,22 @@ def main(words: Sequence[str]) -> int:
     keep_compiled_programs()
     console = Console()
     diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
-    evaluation, class_map = evaluate_run(
-        arguments.run,
-        arguments.ground_truth,
-        TruthOptions(
-            arguments.target, choose_coding(arguments.remap, arguments.palette), arguments.truth_crs, diameters_m
-        ),
-        ScoringOptions(
-            cell_size_m=arguments.cell_size_m,
-            rock_fraction=arguments.rock_fraction,
-            max_range_m=arguments.max_range_m,
-            register=arguments.register,
-            found_share=arguments.found_share,
-        ),
+    coding = choose_coding(arguments.remap, arguments.palette)
+    options = ScoringOptions(
+        cell_size_m=arguments.cell_size_m,
+        rock_fraction=arguments.rock_fraction,
+        max_range_m=arguments.max_range_m,
+        register=arguments.register,
+        found_share=arguments.found_share,
     )
+    # The system of a map is that of the poses it was made of.
+    with options_as(lambda option: "jaxmap map --crs" if option == "--crs" else option):
+        evaluation, class_map = evaluate_run(
+            arguments.run,
+            arguments.ground_truth,
+            TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m),
+            options,
+        )
     scores = evaluation.scores
     folder = RunFolder(arguments.run)
     out, picture = folder.scores, folder.errors

@@ -68,6 +68,10 @@ class RefineArguments:
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631."""
+    remap: tuple[str, ...] = ()
+    """What the values of the orthomosaic mean: 0=unlabelled 7=rock '*=sand', or colours: '#b23c2e=rock'."""
+    palette: Path | None = None
+    """The same as a YAML file of CODE: CLASS."""
     truth_crs: str | None = None
     """Coordinate reference system of the ground truth, in place of its own."""
     max_pose_gap_s: float = 1.0
@@ -87,6 +91,7 @@ def main(words: Sequence[str]) -> int:
 
     from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets import ReadOptions
+    from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.map_evaluation import TruthOptions
     from jaxmap.refine_folder import CALIBRATION, OUTPUTS, check_apart
     from jaxmap.refine_run import GroundFiles, run_refine
@@ -106,9 +111,8 @@ def main(words: Sequence[str]) -> int:
         stop=arguments.stop,
         stride=arguments.stride,
     )
-    files = GroundFiles(
-        arguments.ground_truth, TruthOptions(crs=arguments.truth_crs), arguments.dem, arguments.ground_below_camera_m
-    )
+    truth = TruthOptions(coding=choose_coding(arguments.remap, arguments.palette), crs=arguments.truth_crs)
+    files = GroundFiles(arguments.ground_truth, truth, arguments.dem, arguments.ground_below_camera_m)
     check_apart(arguments.sequence, arguments.out, options)
     with console.steps("refining", "steps", 100) as advance:
         content = run_refine(

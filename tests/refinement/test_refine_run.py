@@ -15,6 +15,7 @@ from rasterio.transform import from_origin
 from refinement.synthetic import disturbed, pose_errors
 from scenes import BOXES_M, CAMERA, pose, timestamp_s
 from scipy.spatial.transform import Rotation
+from tune_faults import labels_from_above, write_truth
 
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.calibration import read_camera_yaml, read_mounting, write_camera_yaml
@@ -181,6 +182,17 @@ def test_bad_input_is_told_in_one_line(cli, scene_folder, tmp_path):
     status, error = fault(cli, scene_folder, scene_folder)
     assert (status, "the sequence's own" in error) == (2, True)
     assert fault(cli, scene_folder, scene_folder, "--poses", scene_folder / "poses.tum")[0] == 2
+
+
+def test_what_an_orthomosaic_means_can_be_said(cli, scene_folder, tmp_path):
+    codes = np.array([0, 40, 200], np.uint8)[labels_from_above()]
+    truth = write_truth(tmp_path / "truth.tif", codes)
+    words = ("--ground-truth", truth, "--stop", 2, "--max-depth-m", 5)
+    status, error = fault(cli, scene_folder, tmp_path / "out", *words)
+    assert (status, "mean nothing" in error, "--remap" in error) == (1, True, True)
+    (tmp_path / "palette.yaml").write_text("0: unlabelled\n40: sand\n200: rock\n")
+    for more in (("--remap", "0=unlabelled", "40=sand", "200=rock"), ("--palette", tmp_path / "palette.yaml")):
+        assert cli("refine", scene_folder, "--out", tmp_path / more[0], *words, *more).status == 0
 
 
 def test_files_of_others_are_not_replaced(cli, scene_folder, tmp_path):

@@ -150,6 +150,19 @@ FAULTS = {
     "a truth of one known class": (2, ("--map-truth.remap", "1=mud", "2=rock"), "fewer than two classes"),
     "codes without a meaning": (1, ("--map-truth.remap", "1=sand", "3=rock"), "mean nothing"),
     "no such orthomosaic": (1, ("--ground-truth", "gone.tif"), "no such file"),
+    "codes that are told": (1, ("--map-truth.remap", "1=sand", "3=rock"), "name them all (--map-truth.remap "),
+    "a truth of another system": (
+        1,
+        ("--mapping.crs", "EPSG:32631", "--map-truth.crs", "EPSG:32633"),
+        "does not lie over the map",
+    ),
+    "no depth": (2, ("--mapping.depth.min-m", "9"), "set --mapping.depth.max-m"),
+    "too large a map": (
+        1,
+        ("--mapping.grid.max-memory-gib", "1e-5"),
+        "or raise --mapping.grid.max-memory-gib",
+    ),
+    "no poses": (1, ("--mapping.poses", "gone.tum"), "there is no file gone.tum"),
     "no frame to teach": (1, ("--data.validation-share", "0.95"), "held out"),
 }
 
