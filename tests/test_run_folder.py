@@ -68,6 +68,7 @@ def test_overwriting_keeps_pictures_that_are_not_the_runs(cli, scene_folder, fin
 
 def test_two_runs_do_not_share_a_folder(cli, scene_folder, tmp_path):
     run = tmp_path / "run"
+    run.mkdir()
     with RunFolder(run).locked():
         outcome = cli(*map_words(scene_folder, run))
     assert outcome.status == 1

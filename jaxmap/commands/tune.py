@@ -79,6 +79,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.map_evaluation import TruthOptions
+    from jaxmap.output_folder import locked
     from jaxmap.tuning.descent import DescentOptions
     from jaxmap.tuning.map_loss import LossOptions
     from jaxmap.tuning_run import Source, TuneOptions, TuningRun
@@ -111,10 +112,11 @@ def main(words: Sequence[str]) -> int:
         arguments.out,
         tell=console.tell,
     )
-    with console.steps("reading", "frames", run.frames) as advance:
-        run.cache(advance)
-    with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
-        result = run.tune(advance)
+    with locked(arguments.out.parent):
+        with console.steps("reading", "frames", run.frames) as advance:
+            run.cache(advance)
+        with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
+            result = run.tune(advance)
     _print(console, result)
     out = arguments.out
     console.result(out.parent, [out.name, out.with_suffix(".json").name, out.with_suffix(".html").name])
@@ -141,13 +143,12 @@ def _check(arguments: TuneArguments, config: MapConfig) -> None:
     inputs = (config.poses, config.calibration, arguments.palette, *arguments.poses_of)
     if arguments.out.resolve() in {path.resolve() for path in inputs if path is not None}:
         raise UsageError("an input would be overwritten", where=arguments.out, fix="choose another --out")
-    there = [path for suffix in ("", ".json", ".html") if (path := _beside(arguments.out, suffix)).exists()]
+    outputs = [arguments.out, *(arguments.out.with_suffix(suffix) for suffix in (".json", ".html"))]
+    if folders := [path for path in outputs if path.is_dir()]:
+        raise UsageError("cannot be written: it is a folder", where=folders[0], fix="choose another --out")
+    there = [path for path in outputs if path.exists()]
     if there and not arguments.overwrite:
         raise UsageError("there already", where=there[0], fix="choose another --out, or add --overwrite")
-
-
-def _beside(out: Path, suffix: str) -> Path:
-    return out.with_suffix(suffix) if suffix else out
 
 
 def _print(console: Console, result: dict) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 
@@ -11,10 +12,12 @@ import yaml
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
 from tune_faults import tune_words, write_truth
 
+import jaxmap.output_folder
 import jaxmap.tuning_run
 from jaxmap.config import load_config
 from jaxmap.errors import JaxmapError
 from jaxmap.map_store import load_map
+from jaxmap.output_folder import locked
 from jaxmap.tuning.descent import Losses, Step
 
 SHORT = ("--steps", "6", "--held-out-share", "0.4")
@@ -102,6 +105,27 @@ def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder
     assert cli(*tune_words(scene_folder, truth, out, *SHORT, "--overwrite")).status == 1
     assert load_config(str(out)).fusion.class_increments is not None
     assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
+
+
+def test_two_runs_do_not_share_a_folder(cli, scene_folder, truth, tmp_path):
+    with locked(tmp_path):
+        outcome = cli(*tune_words(scene_folder, truth, tmp_path / "fusion.yaml", *SHORT))
+    assert (outcome.status, "another run is writing here" in outcome.error) == (1, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, truth, tmp_path, monkeypatch):
+    def refused(**_):
+        raise PermissionError(errno.EACCES, "refused")
+
+    monkeypatch.setattr(jaxmap.tuning_run.TuningRun, "cache", lambda *_: pytest.fail("it reads first"))
+    (tmp_path / "fusion.html").mkdir()
+    outcome = cli(*tune_words(scene_folder, truth, tmp_path / "fusion.yaml", *SHORT, "--overwrite"))
+    assert (outcome.status, "it is a folder" in outcome.error) == (2, True)
+    monkeypatch.setattr(jaxmap.output_folder, "TemporaryFile", refused)
+    outcome = cli(*tune_words(scene_folder, truth, tmp_path / "new" / "fusion.yaml", *SHORT))
+    assert (outcome.status, "no permission to write" in outcome.error) == (1, True)
+    assert not (tmp_path / "new").exists(), "nothing is left of it"
 
 
 def test_an_input_is_not_overwritten(cli, scene_folder, truth, tmp_path):
