@@ -82,6 +82,8 @@ class RefineArguments:
     """Frame to stop before, from the end if negative; by default the end."""
     stride: int = 1
     """Take every so many frames."""
+    overwrite: bool = False
+    """Replace a refinement that lies in the folder."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -122,6 +124,7 @@ def main(words: Sequence[str]) -> int:
             _prior(arguments),
             files,
             max_depth_m=arguments.max_depth_m,
+            overwrite=arguments.overwrite,
             advance=lambda share, note: advance(round(100 * share), note),
             tell=console.tell,
         )

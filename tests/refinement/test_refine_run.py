@@ -17,9 +17,11 @@ from scenes import BOXES_M, CAMERA, pose, timestamp_s
 from scipy.spatial.transform import Rotation
 from tune_faults import labels_from_above, write_truth
 
+import jaxmap.refine_run
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.calibration import read_camera_yaml, read_mounting, write_camera_yaml
 from jaxmap.datasets.pose_files import read_poses, write_tum
+from jaxmap.output_folder import locked
 from jaxmap.stereo.rectify import make_rectifier, make_stereo_rig
 
 FRAMES = 4
@@ -204,12 +206,50 @@ def test_files_of_others_are_not_replaced(cli, scene_folder, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_an_earlier_calibration_does_not_lie_beside_new_poses(cli, scene_folder, tmp_path):
-    for name in ("refine.json", "calibration.yaml"):
-        (tmp_path / name).write_text("{}")
-    assert cli("refine", scene_folder, "--out", tmp_path, "--stop", 2, "--max-depth-m", 5).status == 0
-    assert json.loads((tmp_path / "refine.json").read_text())["frames"] == ["f000", "f001"]
-    assert not (tmp_path / "calibration.yaml").exists()
+def test_results_that_are_no_refinement_s_are_those_of_others(cli, scene_folder, tmp_path):
+    for text in ("{}", "[1]", "mine", "[" * 100_000):
+        (tmp_path / "refine.json").write_text(text)
+        status, error = fault(cli, scene_folder, tmp_path, "--stop", 2, "--overwrite")
+        assert (status, "no refinement has written" in error) == (1, True)
+        assert (tmp_path / "refine.json").read_text() == text
+
+
+def test_an_earlier_refinement_is_replaced_only_on_demand(cli, refined, scene_folder, tmp_path):
+    out = Path(shutil.copytree(refined, tmp_path / "out"))
+    # What an earlier refinement may have left, and what is the user's.
+    for name in ("calibration.yaml", "holiday.png"):
+        (out / name).write_text("{}")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    words = ("--stop", 2, "--max-depth-m", 5)
+    status, error = fault(cli, scene_folder, out, *words)
+    assert (status, "holds a refinement already" in error, "--overwrite" in error) == (1, True, True)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert cli("refine", scene_folder, "--out", out, *words, "--overwrite").status == 0
+    assert json.loads((out / "refine.json").read_text())["frames"] == ["f000", "f001"]
+    assert len(read_poses(out / "poses.tum").T) == 2
+    assert {path.name for path in out.iterdir()} == before.keys() - {"calibration.yaml"}
+
+
+def test_a_refinement_that_fails_leaves_the_earlier_one(cli, refined, scene_folder, tmp_path):
+    out = Path(shutil.copytree(refined, tmp_path / "out"))
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert fault(cli, scene_folder, out, "--stop", 1, "--overwrite")[0] == 1
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_two_runs_do_not_share_a_folder(cli, scene_folder, tmp_path):
+    out = tmp_path / "out"
+    with locked(out):
+        status, error = fault(cli, scene_folder, out, "--stop", 2)
+    assert (status, "another run is writing here" in error) == (1, True)
+    assert not out.exists(), "what was made for nothing is gone"
+
+
+def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(jaxmap.refine_run, "read_inputs", lambda *_: pytest.fail("it reads first"))
+    (tmp_path / "file").write_text("")
+    status, error = fault(cli, scene_folder, tmp_path / "file", "--stop", 2)
+    assert (status, "cannot be made: it is a file" in error) == (1, True)
 
 
 def test_frames_that_share_nothing_are_told(cli, scene_folder, tmp_path):
