@@ -10,7 +10,6 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxmap.config import MapConfig
 from jaxmap.datasets.crs import Extent, read_crs
 from jaxmap.datasets.label_coding import choose_coding
 from jaxmap.datasets.orthomosaic import read_label_orthomosaic
@@ -27,7 +26,7 @@ from jaxmap.sequence import prepare_frames
 from jaxmap.training.batches import Order
 from jaxmap.training.losses import class_weights
 from jaxmap.training.starts import make_start
-from jaxmap.training_config import TrainConfig, option_here
+from jaxmap.training_config import TaughtMapping, TrainConfig, option_here
 from jaxmap.training_plan import TrainingPlan, check_scale, told_start
 from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth
 from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
@@ -64,7 +63,7 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, te
             where=path,
             fix="train it on images first, and leave --classes, network and norm as they are there",
         )
-    mapping = replace(config.mapping, labeller="deeplab", model=path, classes=config.classes)
+    mapping = replace(config.mapping, model=path, classes=config.classes)
     with options_as(option_here):
         plan = plan_run(source, mapping, lambda line: tell(with_options(line, option_here)))
         truth, truths = read_cells(plan, config)
@@ -107,7 +106,7 @@ def _check(config: TrainConfig) -> None:
         raise UsageError("augmentation.copies is for images", where="--supervision map", fix="leave it out")
     if jax.local_device_count() > 1:
         raise UsageError("map supervision runs on one device", fix="hide the others (CUDA_VISIBLE_DEVICES=0)")
-    plain = MapConfig()
+    plain = TaughtMapping()
     if named := [name for name in _OF_THE_NETWORK if getattr(config.mapping, name) != getattr(plain, name)]:
         raise UsageError(
             f"mapping.{named[0]} says nothing here: the network that is trained labels",
