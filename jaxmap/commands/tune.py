@@ -82,7 +82,8 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.output_folder import locked
     from jaxmap.tuning.descent import DescentOptions
     from jaxmap.tuning.map_loss import LossOptions
-    from jaxmap.tuning_run import Source, TuneOptions, TuningRun
+    from jaxmap.tuning_plan import Source, TuneOptions
+    from jaxmap.tuning_run import TuningRun
 
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -118,6 +119,8 @@ def main(words: Sequence[str]) -> int:
         with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
             result = run.tune(advance)
     _print(console, result)
+    for note in result["notes"]:
+        console.tell(f"note: {note}")
     out = arguments.out
     console.result(out.parent, [out.name, out.with_suffix(".json").name, out.with_suffix(".html").name])
     return 0

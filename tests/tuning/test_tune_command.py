@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import re
+from html import escape
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.map_store import load_map
 from jaxmap.output_folder import locked
 from jaxmap.tuning.descent import Losses, Step
+from jaxmap.tuning_run import descent_notes
 
 SHORT = ("--steps", "6", "--held-out-share", "0.4")
 
@@ -44,6 +46,7 @@ def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
     assert np.shape(config.fusion.class_kernel) == (3, 3, 3)
 
     told = json.loads(out.with_suffix(".json").read_text())
+    assert told["notes"] == [note for one in told["stages"] for note in descent_notes(one)]
     assert [stage["name"] for stage in told["stages"]] == ["tuned", "with kernel"]
     for stage in told["stages"]:
         held_out = [row["held_out"] for row in stage["history"]]
@@ -105,6 +108,31 @@ def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder
     assert cli(*tune_words(scene_folder, truth, out, *SHORT, "--overwrite")).status == 1
     assert load_config(str(out)).fusion.class_increments is not None
     assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
+
+
+def test_a_descent_that_leads_nowhere_is_told(cli, scene_folder, truth, tmp_path):
+    out = tmp_path / "fusion.yaml"
+    words = ("--steps", "6", "--held-out-share", "0.4", "--learning-rate", "100")
+    outcome = cli(*tune_words(scene_folder, truth, out, *words))
+    assert outcome.status == 0, outcome
+    (note,) = json.loads(out.with_suffix(".json").read_text())["notes"]
+    assert f"note: {note}" in outcome.err and "take a lower --learning-rate" in note
+    assert escape(note) in out.with_suffix(".html").read_text()
+
+
+def stage(best: int, *losses: float) -> dict:
+    history = [{"step": step, "loss": loss, "held_out": loss} for step, loss in enumerate(losses)]
+    return {"name": "tuned", "best_step": best, "history": history}
+
+
+def test_only_descents_that_lead_nowhere_are_told():
+    assert descent_notes(stage(2, 1.0, 0.9, 0.8)) == []
+    (stuck,) = descent_notes(stage(0, 1.0, 0.9))
+    assert "nothing better than the start" in stuck and "--learning-rate" not in stuck
+    (up,) = descent_notes(stage(0, 1.0, 9.0))
+    assert "nothing better than the start" in up and "from 1.000 to 9.000 in 1 steps: take a lower" in up
+    (past,) = descent_notes(stage(1, 1.0, 0.9, 5.0))
+    assert "what is kept is of step 1: take a lower --learning-rate" in past
 
 
 def test_two_runs_do_not_share_a_folder(cli, scene_folder, truth, tmp_path):
