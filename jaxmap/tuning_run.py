@@ -15,7 +15,7 @@ import jaxmap
 from jaxmap.config import MapConfig
 from jaxmap.files import atomic_path, remove
 from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.mapping_plan import Tell
+from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json, write_yaml
 from jaxmap.report.tuning_page import tuning_page
 from jaxmap.sequence import prepare_frames
