@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -60,6 +60,18 @@ def _check_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise write_error(error, folder) from error
+
+
+def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
+    """Refuses to write over what is read.
+
+    Raises:
+        UsageError: an output lies where an input does.
+    """
+    read = {path.resolve() for path in inputs if path is not None}
+    for path in outputs:
+        if path.resolve() in read:
+            raise UsageError("an input would be overwritten", where=path, fix="choose another --out")
 
 
 def check_same_settings(path: Path, tree: dict[str, Any]) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
-from jaxmap.datasets import ReadOptions
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.files import remove
+from jaxmap.output_folder import check_inputs_stay
 
 RESULTS = "refine.json"
 """Written first: where it lies, the other files are a refinement's."""
@@ -19,7 +20,7 @@ OUTPUTS = ("poses.tum", RESULTS, *PAGE)
 CALIBRATION = "calibration.yaml"
 
 
-def check_apart(source: str, out: Path, options: ReadOptions) -> None:
+def check_apart(source: str, out: Path, inputs: Iterable[Path | None]) -> None:
     """Refuses to write where inputs lie; to be called before anything is made.
 
     Raises:
@@ -27,10 +28,7 @@ def check_apart(source: str, out: Path, options: ReadOptions) -> None:
     """
     if out.resolve() == Path(source).resolve():
         raise UsageError("the folder is the sequence's own", where=out, fix="choose another --out")
-    inputs = {path.resolve() for path in (options.poses, options.calibration) if path is not None}
-    for name in (*OUTPUTS, CALIBRATION):
-        if (out / name).resolve() in inputs:
-            raise UsageError("an input would be overwritten", where=out / name, fix="choose another --out")
+    check_inputs_stay((out / name for name in (*OUTPUTS, CALIBRATION)), inputs)
 
 
 def begin(out: Path, *, overwrite: bool) -> None:

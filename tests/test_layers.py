@@ -126,6 +126,7 @@ SAME_FLOOR = {
     ("jaxmap.map_evaluation", "jaxmap.run_folder"),
     ("jaxmap.refine_run", "jaxmap.output_folder"),
     ("jaxmap.refine_run", "jaxmap.refine_folder"),
+    ("jaxmap.refine_folder", "jaxmap.output_folder"),
     ("jaxmap.refine_run", "jaxmap.map_evaluation"),
     ("jaxmap.cli", "jaxmap.commands"),
     ("jaxmap.__main__", "jaxmap.cli"),

@@ -11,6 +11,7 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import JaxmapError, UsageError, options_as
+from jaxmap.output_folder import check_inputs_stay
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
 
 
@@ -62,12 +63,7 @@ RANKING_COLUMNS = {"by": "missed, by", **MISSED_COLUMNS}
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(EvaluateArguments, "evaluate", words)
-    if not arguments.ground_truth:
-        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
-    if arguments.out is not None and arguments.out.suffix.lower() != ".json":
-        raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
-    if min(arguments.rock_diameters_m) <= 0:
-        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
+    _check(arguments)
 
     from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets.label_coding import choose_coding
@@ -78,6 +74,12 @@ def main(words: Sequence[str]) -> int:
 
     keep_compiled_programs()
     console = Console()
+    folder = RunFolder(arguments.run)
+    out, picture = folder.scores, folder.errors
+    if arguments.out is not None:
+        out, picture = arguments.out, arguments.out.with_name(f"{arguments.out.stem}_errors.png")
+    read = (arguments.backdrop, arguments.palette, *arguments.ground_truth, folder.metrics, folder.poses)
+    check_inputs_stay((out, picture), read)
     diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
     coding = choose_coding(arguments.remap, arguments.palette)
     options = ScoringOptions(
@@ -96,10 +98,6 @@ def main(words: Sequence[str]) -> int:
             options,
         )
     scores = evaluation.scores
-    folder = RunFolder(arguments.run)
-    out, picture = folder.scores, folder.errors
-    if arguments.out is not None:
-        out, picture = arguments.out, arguments.out.with_name(f"{arguments.out.stem}_errors.png")
     write_evaluation(out, picture, evaluation, class_map, arguments.backdrop)
     for note in scores["notes"]:
         console.tell(f"note: {note}")
@@ -109,6 +107,15 @@ def main(words: Sequence[str]) -> int:
         names += _report_anew(console, arguments.run)
     console.result(out.parent, names)
     return 0
+
+
+def _check(arguments: EvaluateArguments) -> None:
+    if not arguments.ground_truth:
+        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
+    if arguments.out is not None and arguments.out.suffix.lower() != ".json":
+        raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
+    if min(arguments.rock_diameters_m) <= 0:
+        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
 
 
 def _report_anew(console: Console, run: Path) -> list[str]:

@@ -113,9 +113,10 @@ def main(words: Sequence[str]) -> int:
         stop=arguments.stop,
         stride=arguments.stride,
     )
+    inputs = (arguments.poses, arguments.calibration, arguments.dem, arguments.palette, *arguments.ground_truth)
+    check_apart(arguments.sequence, arguments.out, inputs)
     truth = TruthOptions(coding=choose_coding(arguments.remap, arguments.palette), crs=arguments.truth_crs)
     files = GroundFiles(arguments.ground_truth, truth, arguments.dem, arguments.ground_below_camera_m)
-    check_apart(arguments.sequence, arguments.out, options)
     with console.steps("refining", "steps", 100) as advance:
         content = run_refine(
             arguments.sequence,

@@ -13,6 +13,7 @@ import tyro
 from jaxmap.commands.console import Console, parse
 from jaxmap.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.errors import UsageError
+from jaxmap.output_folder import check_inputs_stay
 
 
 @dataclass(frozen=True)
@@ -143,10 +144,10 @@ def _check(arguments: TuneArguments, config: MapConfig) -> None:
             )
     if arguments.out.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError(f"--out {arguments.out} is not a .yaml file", fix="name a YAML file")
-    inputs = (config.poses, config.calibration, arguments.palette, *arguments.poses_of)
-    if arguments.out.resolve() in {path.resolve() for path in inputs if path is not None}:
-        raise UsageError("an input would be overwritten", where=arguments.out, fix="choose another --out")
     outputs = [arguments.out, *(arguments.out.with_suffix(suffix) for suffix in (".json", ".html"))]
+    start = None if arguments.config is None else Path(arguments.config)
+    given = (start, arguments.palette, *arguments.poses_of, *arguments.ground_truth)
+    check_inputs_stay(outputs, (config.poses, config.calibration, config.model, *given))
     if folders := [path for path in outputs if path.is_dir()]:
         raise UsageError("cannot be written: it is a folder", where=folders[0], fix="choose another --out")
     there = [path for path in outputs if path.exists()]

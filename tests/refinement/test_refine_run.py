@@ -11,6 +11,8 @@ import pytest
 import rasterio
 import yaml
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
+from html_tables import tables_of
+from killed import SLOW_DISK, fill_disk, kill_when
 from rasterio.transform import from_origin
 from refinement.synthetic import disturbed, pose_errors
 from scenes import BOXES_M, CAMERA, pose, timestamp_s
@@ -88,6 +90,16 @@ def test_the_results_tell_what_was_found(refined):
     assert "heading deg" in page
     assert 'class="chart"' in page and "svg.chart {" in page, "without its style, the curve is a black square"
     assert not (refined / "calibration.yaml").exists()
+    whole_map, frames = tables_of(page)
+    assert whole_map.headings == ["", "found", "± 1 σ", "given ± 1 σ", "told by the data"]
+    found = whole_map.row("up m")
+    assert found[-1] == "yes" and float(found[1]) == pytest.approx(whole["up_m"]["sigma"], rel=0.02)
+    assert float(found[2]) == pytest.approx(whole["up_m"]["prior_sigma"], rel=0.02)
+    assert frames.headings == ["Frame", "moved, m", "± m", "turned, deg", "± deg", "matched"]
+    moved, _, turned, _, matched = frames.row("f002")
+    assert float(moved) == pytest.approx(content["poses"]["moved_m"][2], rel=0.02)
+    assert float(turned) == pytest.approx(content["poses"]["turned_deg"][2], rel=0.02)
+    assert matched == "yes"
 
 
 def test_a_map_is_made_of_the_refined_poses(cli, refined, scene_folder, tmp_path):
@@ -250,6 +262,52 @@ def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, tmp_p
     (tmp_path / "file").write_text("")
     status, error = fault(cli, scene_folder, tmp_path / "file", "--stop", 2)
     assert (status, "cannot be made: it is a file" in error) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ("--poses", "poses.tum"),
+        ("--calibration", "calibration.yaml"),
+        ("--palette", "calibration.yaml"),
+        ("--dem", "trajectory.png"),
+        ("--ground-truth", "consistency.png"),
+    ],
+)
+def test_an_input_is_not_overwritten(option, name, cli, scene_folder, tmp_path):
+    (tmp_path / name).write_text("mine")
+    status, error = fault(cli, scene_folder, tmp_path, option, tmp_path / name, "--overwrite")
+    assert (status, "an input would be overwritten" in error) == (2, True)
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["refine.json", "poses.tum", "trajectory.png"])
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(name, cli, scene_folder, tmp_path, monkeypatch):
+    out, words = tmp_path / "out", ("--stop", 2, "--max-depth-m", 5)
+    with monkeypatch.context() as patch:
+        fill_disk(patch, name)
+        status, error = fault(cli, scene_folder, out, *words)
+    assert (status, "disk full" in error) == (1, True)
+    order = ["refine.json", "poses.tum", "consistency.png", "trajectory.png", "report.html"]
+    left = sorted(path.name for path in out.iterdir()) if out.exists() else []
+    assert left == sorted(order[: order.index(name)])
+    if "poses.tum" in left:
+        assert len(read_poses(out / "poses.tum").T) == 2
+    assert cli("refine", scene_folder, "--out", out, *words, "--overwrite").status == 0
+    assert {path.name for path in out.iterdir()} == set(order), "no leftovers"
+
+
+def test_a_killed_process_leaves_nothing_half_written_and_is_begun_anew(cli, refined, scene_folder, tmp_path):
+    out = Path(shutil.copytree(refined, tmp_path / "out"))
+    words = ("refine", scene_folder, "--out", out, "--stop", 2, "--max-depth-m", 5)
+    kill_when(lambda: list(out.glob(".poses.tmp-*")), SLOW_DISK, (*words, "--overwrite"))
+    assert json.loads((out / "refine.json").read_text())["frames"] == ["f000", "f001"]
+    left = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+    assert left == {"refine.json"}, "nothing of the earlier refinement lies beside the results of this one"
+    assert cli(*words).status == 1, "it is not replaced unasked"
+    assert cli(*words, "--overwrite").status == 0
+    names = {"refine.json", "poses.tum", "consistency.png", "trajectory.png", "report.html"}
+    assert {path.name for path in out.iterdir()} == names, "no leftovers"
 
 
 def test_frames_that_share_nothing_are_told(cli, scene_folder, tmp_path):

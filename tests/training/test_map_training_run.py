@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scenes
 from fixtures import cli, shared_cache  # noqa: F401
+from killed import kill_when
 from tiny_training import ARCHITECTURE as TINY
 from tiny_training import network_is_tiny  # noqa: F401
 from truth_files import write_raster
@@ -120,6 +121,33 @@ def test_an_interrupted_run_goes_on_exactly(cli, finished, place, tmp_path, monk
     assert cli(*words(place, run, "--resume")).status == 0
     assert (run / "model.safetensors").read_bytes() == (finished / "model.safetensors").read_bytes()
     assert history_of(run) == history_of(finished)
+
+
+SLOWLY = """\
+import sys, time
+from jaxmap.training_log import Meter
+from tiny_training import main, tiny_network
+
+add = Meter.add
+def slowly(*words):
+    time.sleep(0.5)
+    return add(*words)
+Meter.add = slowly
+with tiny_network():
+    sys.exit(main(sys.argv[1:]))
+"""
+"""Each step takes a while, so that the process dies in the middle of the run."""
+
+
+def test_a_killed_process_is_gone_on_with(cli, finished, place, tmp_path):
+    run = tmp_path / "run"
+    kill_when(lambda: [path for path in run.glob("checkpoints/*") if path.name.isdecimal()], SLOWLY, words(place, run))
+    assert len(history_of(run)) < len(history_of(finished))
+    assert cli(*words(place, run)).status == 1, "it is not replaced unasked"
+    assert cli(*words(place, run, "--resume")).status == 0
+    assert (run / "model.safetensors").read_bytes() == (finished / "model.safetensors").read_bytes()
+    assert history_of(run) == history_of(finished)
+    assert {path.name for path in run.iterdir()} == {path.name for path in finished.iterdir()}, "no leftovers"
 
 
 def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(place):

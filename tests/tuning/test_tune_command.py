@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
+from html_tables import tables_of
+from killed import SLOW_DISK, fill_disk, kill_when
 from tune_faults import tune_words, write_truth
 
 import jaxmap.output_folder
@@ -56,6 +58,20 @@ def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
     assert told["before"]["occupancy_hit"] == pytest.approx(0.85)
 
     page = out.with_suffix(".html").read_text()
+    held_out, tuned_on, *_, numbers, traverses = tables_of(page)
+    assert held_out.headings == tuned_on.headings == ["", "before", "after", "change"]
+    row, scores = held_out.row("IoU"), told["stages"][0]["scores"]["held_out"]["iou"]
+    assert [text.split(" ")[0] for text in row] == [f"{scores[when]:.3f}" for when in ("before", "after", "change")]
+    assert numbers.headings == ["", "before", "tuned", "with kernel"]
+    first, *others = (told["before"], *(one["parameters"] for one in told["stages"]))
+    assert [float(text) for text in numbers.row("occupancy hit")] == pytest.approx(
+        [first["occupancy_hit"], *(one["occupancy_hit"] for one in others)], rel=0.01
+    )
+    assert traverses.headings == ["Sequence", "frames", "cells", "held out"]
+    (one,) = told["traverses"]
+    assert [int(text.replace(",", "")) for text in traverses.row(one["sequence"])] == [
+        one[key] for key in ("frames", "cells", "held_out_cells")
+    ]
     assert page.startswith("<!doctype html>")
     assert page.count("<svg") == 6
     assert not re.search(r'(src|href)="(?!data:|#)', page)
@@ -156,12 +172,45 @@ def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, truth
     assert not (tmp_path / "new").exists(), "nothing is left of it"
 
 
-def test_an_input_is_not_overwritten(cli, scene_folder, truth, tmp_path):
-    camera = tmp_path / "camera.yaml"
-    camera.write_bytes((scene_folder / "camera.yaml").read_bytes())
-    outcome = cli(*tune_words(scene_folder, truth, camera, *SHORT, "--overwrite", "--calibration", camera))
+@pytest.mark.parametrize(
+    ("option", "suffix"),
+    [(f"--{name}", "yaml") for name in ("calibration", "poses", "palette", "config")] + [("--poses-of", "json")],
+)
+def test_an_input_is_not_overwritten(option, suffix, cli, scene_folder, truth, tmp_path):
+    mine = tmp_path / f"mine.{suffix}"
+    mine.write_text("stride: 1")
+    words = (*SHORT, "--overwrite", option, mine)
+    outcome = cli(*tune_words(scene_folder, truth, tmp_path / "mine.yaml", *words))
     assert (outcome.status, "would be overwritten" in outcome.error) == (2, True)
-    assert camera.read_bytes() == (scene_folder / "camera.yaml").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == [mine.name] and mine.read_text() == "stride: 1"
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json", ".html"])
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+    suffix, cli, scene_folder, truth, tmp_path, monkeypatch
+):
+    out, words = tmp_path / "fusion.yaml", ("--steps", "1", "--held-out-share", "0.4")
+    with monkeypatch.context() as patch:
+        fill_disk(patch, f"fusion{suffix}")
+        outcome = cli(*tune_words(scene_folder, truth, out, *words))
+    assert (outcome.status, "disk full" in outcome.error) == (1, True)
+    order = [".yaml", ".json", ".html"]
+    assert {path.suffix for path in tmp_path.iterdir()} == set(order[: order.index(suffix)])
+    if suffix != ".yaml":
+        assert load_config(str(out)).fusion.class_increments is not None
+    assert cli(*tune_words(scene_folder, truth, out, *words, "--overwrite")).status == 0
+    assert {path.suffix for path in tmp_path.iterdir()} == set(order), "no leftovers"
+
+
+def test_a_killed_process_leaves_the_best_so_far_and_is_begun_anew(cli, scene_folder, truth, tmp_path):
+    out = tmp_path / "fusion.yaml"
+    words = tune_words(scene_folder, truth, out, *SHORT)
+    kill_when(lambda: out.exists() and list(tmp_path.glob(".fusion.tmp-*")), SLOW_DISK, words)
+    assert load_config(str(out)).fusion.class_increments is not None
+    assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
+    assert cli(*words).status == 2, "it is not replaced unasked"
+    assert cli(*words, "--overwrite").status == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"fusion.yaml", "fusion.json", "fusion.html"}
 
 
 def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, truth, tmp_path):
