@@ -21,6 +21,7 @@ _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 Triple = tuple[float, float, float]
 Probability = Annotated[float, Interval(gt=0, lt=1)]
 Positive = Annotated[float, Gt(0)]
+LabellerName = Literal["plane", "deeplab", "files", "none"]
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ class MapConfig:
 
     dataset: str = "auto"
     """The reader: auto, kitti, euroc, folder or katwijk."""
-    labeller: Literal["plane", "deeplab", "files", "none"] = "plane"
+    labeller: LabellerName = "plane"
     """What labels the points: the MLESAC plane, a network, files of labels, or nothing."""
     model: Path | None = None
     """Model file of the network, with the deeplab labeller (train and weights import write them); by default the

@@ -10,11 +10,10 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxmap.config import MapConfig
 from jaxmap.datasets.crs import Extent, read_crs
-from jaxmap.datasets.label_coding import DEFAULT_CODING, LabelCoding, parse_coding
+from jaxmap.datasets.label_coding import choose_coding
 from jaxmap.datasets.orthomosaic import read_label_orthomosaic
-from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.errors import JaxmapError, UsageError, options_as, with_options
 from jaxmap.files import bundled
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import exact_corner
@@ -27,7 +26,7 @@ from jaxmap.sequence import prepare_frames
 from jaxmap.training.batches import Order
 from jaxmap.training.losses import class_weights
 from jaxmap.training.starts import make_start
-from jaxmap.training_config import TrainConfig
+from jaxmap.training_config import TaughtMapping, TrainConfig, option_here
 from jaxmap.training_plan import TrainingPlan, check_scale, told_start
 from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth
 from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
@@ -64,10 +63,11 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, te
             where=path,
             fix="train it on images first, and leave --classes, network and norm as they are there",
         )
-    mapping = replace(config.mapping, labeller="deeplab", model=path, classes=config.classes)
-    plan = plan_run(source, mapping, tell)
-    truth, truths = read_cells(plan, config)
-    frames = keep_frames(plan, truth, saved, config.map_truth.anchor, tell)
+    mapping = replace(config.mapping, model=path, classes=config.classes)
+    with options_as(option_here):
+        plan = plan_run(source, mapping, lambda line: tell(with_options(line, option_here)))
+        truth, truths = read_cells(plan, config)
+        frames = keep_frames(plan, truth, saved, config.map_truth.anchor, tell)
     train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
     data = MapData(plan, truth, train, validation, config.ground_truth.name)
     counts = class_pixels(train, len(config.classes))
@@ -101,12 +101,12 @@ def _check(config: TrainConfig) -> None:
             "loss.lovasz and loss.label_smoothing are of pixels", where="--supervision map", fix="leave them out"
         )
     if not (losses.cross_entropy or losses.soft_iou):
-        raise UsageError("every loss has a weight of 0", where="--loss", fix="give one of them a weight")
+        raise UsageError("every loss has a weight of 0", where="loss", fix="give one of them a weight")
     if config.augmentation.copies is not None:
         raise UsageError("augmentation.copies is for images", where="--supervision map", fix="leave it out")
     if jax.local_device_count() > 1:
         raise UsageError("map supervision runs on one device", fix="hide the others (CUDA_VISIBLE_DEVICES=0)")
-    plain = MapConfig()
+    plain = TaughtMapping()
     if named := [name for name in _OF_THE_NETWORK if getattr(config.mapping, name) != getattr(plain, name)]:
         raise UsageError(
             f"mapping.{named[0]} says nothing here: the network that is trained labels",
@@ -130,7 +130,7 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
     """
     options, path = config.map_truth, config.ground_truth
     assert path is not None
-    coding: LabelCoding = DEFAULT_CODING if options.remap is None else parse_coding(options.remap, "map_truth.remap")
+    coding = choose_coding(options.remap or (), None, "map_truth.remap")
     named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
     shown = [index for index, name in enumerate(config.classes) if name in named]
     if len(shown) < 2:

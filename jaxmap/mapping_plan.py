@@ -13,39 +13,24 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from jaxmap.config import GridConfig, MapConfig, Triple, split_fusion
+from jaxmap.config import MapConfig, split_fusion
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
-from jaxmap.datasets.label_files import LabelFolder, open_label_folder
+from jaxmap.datasets.label_files import LabelFolder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
-from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.ensemble.draws import draw_ensemble
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.files import bundled
 from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
-from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
-from jaxmap.labels import ROVER_CLASSES
+from jaxmap.geometry.bounds import check_memory, usable_depth
+from jaxmap.labellers import Labeller
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
-from jaxmap.models.checkpoint import SavedModel, load_network
-from jaxmap.models.tensor_files import shortened
+from jaxmap.mapping_grid import choose_grid, told_grid
+from jaxmap.mapping_labels import ModelFile, choose_label_folder, choose_labeller, choose_model, told_network
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.rectify import StereoRig
-from jaxmap.types import GridSpec, make_grid
+from jaxmap.types import GridSpec
 
 Tell = Callable[[str], None]
 
 _KEY_FRAMES = 4
-
-DEFAULT_VOXELS_M: tuple[Triple, ...] = ((0.05, 0.05, 0.2), (0.1, 0.1, 0.2), (0.2, 0.2, 0.2))
-"""The voxels of a map whose settings name none, the finest that fits."""
-
-
-@dataclass(frozen=True)
-class ModelFile:
-    """The file of the network that labels, and the SHA-256 of its content."""
-
-    path: Path
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -138,18 +123,18 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
             fix="set --depth.max-m",
         )
     depth_range_m = (config.depth.min_m, max_depth_m)
-    label_folder = _label_folder(config, sequence)
-    model, network = _model(config)
+    label_folder = choose_label_folder(config, sequence)
+    model, network = choose_model(config)
     with _as_usage_error():
-        labeller = _labeller(config, label_folder, network)
+        labeller = choose_labeller(config, label_folder, network)
         if model is not None and network is not None:
-            tell(_told_network(model, network, labeller.classes))
-        grid = _grid(config, sequence, front_end, max_depth_m, len(labeller.classes))
+            tell(told_network(model, network, labeller.classes))
+        grid = choose_grid(config, sequence, front_end, max_depth_m, len(labeller.classes))
         params, rule = split_fusion(config.fusion, labeller.classes)
         fusion_rule = FusionRule(**rule)
         fusion_params = make_fusion_params(labeller.classes, **params)
         members = _members(config, fusion_rule, labeller.classes)
-    tell(_told_grid(grid, depth_range_m, len(labeller.classes), members))
+    tell(told_grid(grid, depth_range_m, len(labeller.classes), members))
     check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
@@ -184,16 +169,6 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     )
 
 
-def _told_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
-    """One line on what is mapped, and the memory it takes."""
-    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
-    return (
-        f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
-        f"{size} m, {1 + class_count} channels{f' and {members} members of 2' if members else ''}: "
-        f"{map_bytes(grid, class_count, members) / 2**20:.0f} MiB"
-    )
-
-
 def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int:
     """How many members the ensemble has.
 
@@ -220,121 +195,3 @@ def _as_usage_error() -> Iterator[None]:
         raise
     except JaxmapError as error:
         raise UsageError(error.what, where=error.where, fix=error.fix or "see jaxmap map --help") from error
-
-
-def _label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFolder | None:
-    if config.labeller != "files":
-        if config.labels is not None:
-            raise UsageError(
-                f"--labels is given, but the labeller is {config.labeller}", fix="add --labeller files, or leave it out"
-            )
-        return None
-    if config.labels is None:
-        raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
-    labels_are = config.labels_are
-    if labels_are == "auto":
-        if isinstance(sequence.camera, StereoRig):
-            raise UsageError(
-                "the images are raw, and labels may lie on raw or on rectified pixels",
-                fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
-            )
-        labels_are = "rectified"
-    return open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
-
-
-def _model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
-    """The network that labels, where the labeller is one.
-
-    Raises:
-        JaxmapError: the file cannot be read, or holds no whole network.
-        UsageError: it is not the one that the settings tell.
-    """
-    if config.labeller != "deeplab":
-        if config.model is not None:
-            raise UsageError(
-                f"--model is given, but the labeller is {config.labeller}",
-                fix="add --labeller deeplab, or leave it out",
-            )
-        return None, None
-    path = config.model or bundled("rover.safetensors")
-    saved = load_network(path)
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    if config.model_sha256 is not None and config.model_sha256.lower() != sha256:
-        raise UsageError(
-            f"the model's SHA-256 does not start with {config.model_sha256[:16]}",
-            where=path,
-            fix="give the model of that run, or leave out model_sha256",
-        )
-    return ModelFile(path, sha256), saved
-
-
-def _told_network(model: ModelFile, network: SavedModel, classes: Sequence[str]) -> str:
-    """One line on the network and its classes."""
-    count = len(network.architecture.classes)
-    return (
-        f"labels by {model.path.name} ({network.architecture.backbone}, {count} classes), "
-        f"mapped as {shortened(classes)}; --classes and --deeplab.class-map choose"
-    )
-
-
-def _labeller(config: MapConfig, label_folder: LabelFolder | None, network: SavedModel | None) -> Labeller:
-    classes = config.classes
-    if classes is not None and len(set(classes)) < len(classes):
-        raise UsageError(f"a class is named twice: {' '.join(classes)}", fix="give each class once")
-    if network is not None:
-        return make_deeplab_labeller(network, classes, **asdict(config.deeplab))
-    classes = ROVER_CLASSES if classes is None else classes
-    if label_folder is not None:
-        return make_files_labeller(classes, soft=label_folder.soft)
-    if config.labeller == "plane":
-        return make_plane_labeller(classes, **asdict(config.plane))
-    return make_no_labeller()
-
-
-def _grid(
-    config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float, class_count: int
-) -> GridSpec:
-    """The grid that the settings ask for; voxels of no given size are as fine as the memory allows."""
-    if config.grid.voxel_size_m is not None:
-        return _grid_of(config.grid, config.grid.voxel_size_m, sequence, front_end, max_depth_m)
-    grids = (_grid_of(config.grid, size_m, sequence, front_end, max_depth_m) for size_m in DEFAULT_VOXELS_M)
-    limit_bytes = config.grid.max_memory_gib * 2**30
-    coarsest = _grid_of(config.grid, DEFAULT_VOXELS_M[-1], sequence, front_end, max_depth_m)
-    members = config.ensemble.members
-    return next((grid for grid in grids if map_bytes(grid, class_count, members) <= limit_bytes), coarsest)
-
-
-def _grid_of(
-    settings: GridConfig,
-    voxel_size_m: float | Triple,
-    sequence: StereoSequence,
-    front_end: StereoFrontEnd,
-    max_depth_m: float,
-) -> GridSpec:
-    views = grid_around_views(
-        front_end.camera,
-        sequence.T_world_camera @ front_end.T_raw_rectified,
-        max_depth_m,
-        voxel_size_m,
-        (settings.below_camera_m, settings.above_camera_m),
-    )
-    if (settings.lower_m is None) != (settings.upper_m is None):
-        raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
-    if settings.lower_m is None or settings.upper_m is None:
-        return views
-    grid = make_grid(settings.lower_m, settings.upper_m, voxel_size_m)
-    lower, upper = _extent(views)
-    if (np.array(settings.lower_m) >= upper).any() or (np.array(settings.upper_m) <= lower).any():
-        raise UsageError(
-            f"no camera sees the box from {list(settings.lower_m)} to {list(settings.upper_m)}: "
-            f"the views reach from {lower.round(1).tolist()} to {upper.round(1).tolist()}",
-            where="grid bounds",
-            fix="give bounds relative to the site origin",
-        )
-    return grid
-
-
-def _extent(grid: GridSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner of a grid, float64."""
-    lower = np.asarray(grid.origin_m, np.float64)
-    return lower, lower + np.asarray(grid.voxel_size_m, np.float64) * grid.shape

@@ -5,22 +5,26 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.files import atomic_path
+from jaxmap.files import atomic_path, write_error
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keeps other runs out of a folder, which is made where it is missing.
 
+    A folder that was made for a run which then wrote nothing is removed again.
+
     Raises:
-        JaxmapError: another run is writing into it, or it cannot be made.
+        JaxmapError: another run is writing into it, or it cannot be made or written.
     """
+    made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # The folder itself is locked, so that no lock file is left behind.
@@ -30,8 +34,13 @@ def locked(folder: Path) -> Iterator[None]:
         raise JaxmapError(f"cannot be made: {reason}", where=folder, fix="choose another --out") from error
     try:
         _lock(handle, folder)
+        _check_writable(folder)
         yield
     finally:
+        if made:
+            # Refused by the system where something lies in it.
+            with suppress(OSError):
+                folder.rmdir()
         os.close(handle)
 
 
@@ -42,6 +51,27 @@ def _lock(handle: int, folder: Path) -> None:
         raise JaxmapError(
             "another run is writing here", where=folder, fix="wait for it, or choose another --out"
         ) from error
+
+
+def _check_writable(folder: Path) -> None:
+    """Tells before the work what would be told only after it."""
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise write_error(error, folder) from error
+
+
+def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
+    """Refuses to write over what is read.
+
+    Raises:
+        UsageError: an output lies where an input does.
+    """
+    read = {path.resolve() for path in inputs if path is not None}
+    for path in outputs:
+        if path.resolve() in read:
+            raise UsageError("an input would be overwritten", where=path, fix="choose another --out")
 
 
 def check_same_settings(path: Path, tree: dict[str, Any]) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from pathlib import Path
 
-from jaxmap.datasets import ReadOptions
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.files import remove
+from jaxmap.output_folder import check_inputs_stay
 
 RESULTS = "refine.json"
 """Written first: where it lies, the other files are a refinement's."""
@@ -18,37 +20,57 @@ OUTPUTS = ("poses.tum", RESULTS, *PAGE)
 CALIBRATION = "calibration.yaml"
 
 
-def check_apart(source: str, out: Path, options: ReadOptions) -> None:
-    """Refuses to write where inputs or the files of others lie; to be called before anything is made.
+def check_apart(source: str, out: Path, inputs: Iterable[Path | None]) -> None:
+    """Refuses to write where inputs lie; to be called before anything is made.
 
     Raises:
         UsageError: the folder is the sequence's own, or an output would overwrite an input.
-        JaxmapError: files of the same names lie there that no refinement has written.
     """
     if out.resolve() == Path(source).resolve():
         raise UsageError("the folder is the sequence's own", where=out, fix="choose another --out")
-    inputs = {path.resolve() for path in (options.poses, options.calibration) if path is not None}
-    for name in (*OUTPUTS, CALIBRATION):
-        if (out / name).resolve() in inputs:
-            raise UsageError("an input would be overwritten", where=out / name, fix="choose another --out")
-    foreign = [name for name in (*OUTPUTS, CALIBRATION) if (out / name).exists()]
-    if foreign and not (out / RESULTS).is_file():
+    check_inputs_stay((out / name for name in (*OUTPUTS, CALIBRATION)), inputs)
+
+
+def begin(out: Path, *, overwrite: bool) -> None:
+    """Checks that what lies in the folder may be replaced; nothing is removed yet.
+
+    Raises:
+        JaxmapError: it holds a refinement already, or files of the same names that no refinement has written.
+    """
+    there = [name for name in (*OUTPUTS, CALIBRATION) if (out / name).exists()]
+    if not there:
+        return
+    if not _is_refinement(out):
         raise JaxmapError(
-            f"{', '.join(foreign)} would be replaced, but no refinement has written them",
+            f"{', '.join(there)} would be replaced, but no refinement has written them",
             where=out,
             fix="choose another --out",
         )
+    if not overwrite:
+        raise JaxmapError(
+            "the folder holds a refinement already",
+            where=out,
+            fix="replace it (--overwrite), or choose another folder",
+        )
 
 
-def forget_earlier(out: Path, *, calibrated: bool) -> None:
-    """Removes what an earlier refinement has written beside the poses; to be called once they are new.
+def _is_refinement(out: Path) -> bool:
+    """Whether what lies here was written by a refinement."""
+    try:
+        content = json.loads((out / RESULTS).read_text(encoding="utf8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and content.keys() >= {"matches", "map_height_spread_m", "whole_map"}
 
-    Args:
-        out: the folder.
-        calibrated: whether the calibration is new, too.
+
+def forget_earlier(out: Path) -> None:
+    """Removes what an earlier refinement has written beside its results; to be called once there are new ones.
+
+    The results themselves go last, by being replaced: they tell whose the folder is.
 
     Raises:
         JaxmapError: a file cannot be removed.
     """
-    for name in (*PAGE, *(() if calibrated else (CALIBRATION,))):
-        remove(out / name)
+    for name in (*OUTPUTS, CALIBRATION):
+        if name != RESULTS:
+            remove(out / name)

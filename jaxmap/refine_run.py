@@ -24,7 +24,7 @@ from jaxmap.geometry.bounds import usable_depth
 from jaxmap.map_evaluation import TruthOptions, read_truth
 from jaxmap.output_folder import locked, write_json
 from jaxmap.prefetch import prefetch
-from jaxmap.refine_folder import CALIBRATION, RESULTS, forget_earlier
+from jaxmap.refine_folder import CALIBRATION, RESULTS, begin, forget_earlier
 from jaxmap.refinement.anchors import Raster
 from jaxmap.refinement.rounds import Ground, Refinement, refine
 from jaxmap.refinement.solve import Prior
@@ -63,12 +63,14 @@ class RefineInputs:
         front_end: its stereo front end.
         views: one for each frame.
         skipped: names of the other frames, with the reason.
+        seconds: that reading took.
     """
 
     sequence: StereoSequence
     front_end: StereoFrontEnd
     views: list[View]
     skipped: list[dict[str, str]]
+    seconds: float = 0.0
 
     @property
     def T_world_camera(self) -> Float64[np.ndarray, "N 4 4"]:
@@ -87,6 +89,7 @@ def read_inputs(source: str, options: ReadOptions, advance: Advance = lambda don
     Raises:
         JaxmapError: the sequence cannot be read, or fewer than two of its frames can.
     """
+    started_s = time.perf_counter()
     sequence = open_sequence(source, options)
     front_end = StereoFrontEnd(sequence.camera, StereoOptions())
     views: list[View] = []
@@ -120,9 +123,8 @@ def read_inputs(source: str, options: ReadOptions, advance: Advance = lambda don
             fix="refining needs two frames that overlap, or more",
         )
     frames = tuple(sequence.frames[index] for index in kept)
-    return RefineInputs(
-        replace(sequence, frames=frames, T_world_camera=sequence.T_world_camera[kept]), front_end, views, skipped
-    )
+    used = replace(sequence, frames=frames, T_world_camera=sequence.T_world_camera[kept])
+    return RefineInputs(used, front_end, views, skipped, time.perf_counter() - started_s)
 
 
 def ground_of(files: GroundFiles, inputs: RefineInputs, max_depth_m: float) -> tuple[Ground, list[str]]:
@@ -208,6 +210,7 @@ def run_refine(
     files: GroundFiles,
     *,
     max_depth_m: float | None = None,
+    overwrite: bool = False,
     advance: Advance = lambda done, note: None,
     tell: Tell = lambda line: None,
 ) -> dict[str, Any]:
@@ -220,6 +223,7 @@ def run_refine(
         prior: what may be wrong, and by how much.
         files: what is known of the ground.
         max_depth_m: farther points do not count; by default where depth noise reaches `DEPTH_SIGMA_M`.
+        overwrite: replace a refinement that lies in the folder.
         advance: told how far it is.
         tell: takes lines for the user.
 
@@ -227,47 +231,54 @@ def run_refine(
         What is in refine.json.
 
     Raises:
-        JaxmapError: the inputs do not serve, or writing failed.
+        JaxmapError: the inputs do not serve, the folder holds other files, or writing failed.
     """
+    with locked(out):
+        begin(out, overwrite=overwrite)
+        inputs = read_inputs(source, options, advance)
+        for note in inputs.sequence.notes:
+            tell(f"note: {note}")
+        return _refined(out, inputs, prior, files, max_depth_m, advance)
+
+
+def _refined(
+    out: Path, inputs: RefineInputs, prior: Prior, files: GroundFiles, max_depth_m: float | None, advance: Advance
+) -> dict[str, Any]:
+    """Refines what was read, and writes it after every round."""
     started_s = time.perf_counter()
-    inputs = read_inputs(source, options, advance)
     sequence, camera = inputs.sequence, inputs.front_end.camera
-    for note in sequence.notes:
-        tell(f"note: {note}")
     depth_range_m = (0.3, max_depth_m or max(usable_depth(camera, DEPTH_SIGMA_M, 0.5), 0.5))
     ground, notes = ground_of(files, inputs, depth_range_m[1])
     frames = len(inputs.views)
     content: dict[str, Any] = {}
-    with locked(out):
 
-        def keep(state: Refinement) -> None:
-            first = not content
-            content.clear()
-            content.update(results(state, inputs.T_world_camera, prior))
-            content["frames"] = [frame.name for frame in sequence.frames]
-            content["skipped"] = inputs.skipped
-            content["notes"] = [*notes, *state.notes]
-            content["seconds"] = round(time.perf_counter() - started_s, 1)
-            calibrated = _write(out, state, inputs, prior, content)
-            if first:
-                forget_earlier(out, calibrated=calibrated)
+    def keep(state: Refinement) -> None:
+        if not content:
+            forget_earlier(out)
+        content.clear()
+        content.update(results(state, inputs.T_world_camera, prior))
+        content["frames"] = [frame.name for frame in sequence.frames]
+        content["skipped"] = inputs.skipped
+        content["notes"] = [*notes, *state.notes]
+        content["seconds"] = round(inputs.seconds + time.perf_counter() - started_s, 1)
+        _write(out, state, inputs, prior, content)
 
-        state = refine(
-            inputs.views,
-            inputs.T_world_camera,
-            pinhole(camera),
-            prior,
-            ground,
-            depth_range_m,
-            advance=lambda done, note: advance(READING + (1 - READING) * done / (3 * frames), note),
-            on_round=keep,
-        )
-        write_refine_report(out, sequence.name, state, content)
+    state = refine(
+        inputs.views,
+        inputs.T_world_camera,
+        pinhole(camera),
+        prior,
+        ground,
+        depth_range_m,
+        advance=lambda done, note: advance(READING + (1 - READING) * done / (3 * frames), note),
+        on_round=keep,
+    )
+    write_refine_report(out, sequence.name, state, content)
     return content
 
 
-def _write(out: Path, state: Refinement, inputs: RefineInputs, prior: Prior, content: dict[str, Any]) -> bool:
-    """Writes results and poses, and the calibration where something of it was refined; whether it was."""
+def _write(out: Path, state: Refinement, inputs: RefineInputs, prior: Prior, content: dict[str, Any]) -> None:
+    """Writes results and poses, and the calibration where something of it was refined."""
     sequence, front_end = inputs.sequence, inputs.front_end
     T_raw_rectified = front_end.T_raw_rectified
     T_world_raw = state.rig.T_world_camera @ np.linalg.inv(T_raw_rectified)
@@ -275,12 +286,11 @@ def _write(out: Path, state: Refinement, inputs: RefineInputs, prior: Prior, con
     write_json(out / RESULTS, content)
     write_tum(out / "poses.tum", np.array([frame.timestamp_s for frame in sequence.frames]), T_world_raw)
     if not (prior.baseline_scale or prior.offset_px or prior.mounting_m or prior.mounting_rad):
-        return False
+        return
     # The displacement in the frame of the images as they lie on disk.
     T_nominal_raw = T_raw_rectified @ state.rig.T_nominal_camera @ np.linalg.inv(T_raw_rectified)
     mounted = T_nominal_raw if prior.mounting_m or prior.mounting_rad else None
     write_camera_yaml(out / CALIBRATION, _calibrated(sequence.camera, state), mounted)
-    return True
 
 
 def _calibrated(camera: StereoCamera | StereoRig, state: Refinement) -> StereoCamera | StereoRig:

@@ -15,7 +15,7 @@ from jaxmap.config import MapConfig, config_tree
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.map_store import holds_map, load_map
 from jaxmap.mapping_plan import Plan
-from jaxmap.output_folder import check_same_settings, locked, write_yaml
+from jaxmap.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.sequence import FusedFrame
 from jaxmap.types import VoxelMap
 
@@ -146,10 +146,7 @@ class RunFolder:
         images |= {frame.right.parent.resolve() for frame in plan.sequence.frames}
         if here == Path(plan.source).resolve() or any(here == folder or folder in here.parents for folder in images):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
-        inputs = {path.resolve() for path in (config.poses, config.calibration, config.model) if path is not None}
-        for file in self._files:
-            if file.resolve() in inputs:
-                raise UsageError("an input would be overwritten", where=file, fix="choose another --out")
+        check_inputs_stay(self._files, (config.poses, config.calibration, config.model))
 
     def _is_run(self) -> bool:
         """Whether what lies here was written by a run."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Interval
 from pydantic import BeforeValidator
 
-from jaxmap.config import GridConfig, MapConfig
+from jaxmap.config import GridConfig, LabellerName, MapConfig
 from jaxmap.settings import Settings
 from jaxmap.training.options import NetworkOptions, TrainingOptions
 
@@ -52,8 +52,13 @@ class MapTruthConfig:
     """Divides the logits before they are fused, while training: above 1, pixels that are surely wrong can learn."""
 
 
-def _mapping() -> MapConfig:
-    return MapConfig(grid=GridConfig(voxel_size_m=(0.1, 0.1, 0.2)))
+@dataclass(frozen=True)
+class TaughtMapping(MapConfig):
+    """How a sequence is mapped by the network that is trained."""
+
+    labeller: LabellerName = "deeplab"
+    """Only deeplab means something here."""
+    grid: GridConfig = field(default_factory=lambda: GridConfig(voxel_size_m=(0.1, 0.1, 0.2)))
 
 
 @dataclass(frozen=True)
@@ -69,8 +74,18 @@ class TrainConfig(TrainingOptions):
     data: DataConfig = field(default_factory=DataConfig)
     network: NetworkOptions = field(default_factory=NetworkOptions)
     map_truth: MapTruthConfig = field(default_factory=MapTruthConfig)
-    mapping: MapConfig = field(default_factory=_mapping)
+    mapping: TaughtMapping = field(default_factory=TaughtMapping)
     """How the sequence is read and mapped, with map supervision: as the settings of jaxmap map."""
+
+
+_OTHERWISE = {"--remap": "--map-truth.remap", "--truth-crs": "--map-truth.crs", "--classes": "--classes"}
+
+
+def option_here(option: str) -> str:
+    """What `jaxmap train` calls an option of `jaxmap map` or `jaxmap evaluate`; others as they are."""
+    name = option.removeprefix("--").partition(".")[0].replace("-", "_")
+    own = f"--mapping.{option.removeprefix('--')}" if name in MapConfig.__dataclass_fields__ else option
+    return _OTHERWISE.get(option, own)
 
 
 _SETTINGS = Settings(TrainConfig, "train", folder="train", given=("training_data", "init"))

@@ -176,7 +176,7 @@ def plan_training(
     check_scale(config)
     losses = config.loss
     if not (losses.cross_entropy or losses.soft_iou or losses.lovasz):
-        raise UsageError("every loss has a weight of 0", where="--loss", fix="give one of them a weight")
+        raise UsageError("every loss has a weight of 0", where="loss", fix="give one of them a weight")
     devices = jax.local_device_count()
     if config.batch_size % devices:
         raise UsageError(

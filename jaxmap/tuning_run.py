@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,17 +13,15 @@ import numpy as np
 
 import jaxmap
 from jaxmap.config import MapConfig
-from jaxmap.errors import UsageError
 from jaxmap.files import atomic_path, remove
 from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.mapping_plan import Plan, Tell, plan_run
+from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json, write_yaml
 from jaxmap.report.tuning_page import tuning_page
 from jaxmap.sequence import prepare_frames
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
-from jaxmap.tuning.descent import DescentOptions, Step, descend
-from jaxmap.tuning.evidence_cache import BLOCK_PX, CacheRecipe, build_cache, tunable_labels
-from jaxmap.tuning.map_loss import LossOptions
+from jaxmap.tuning.descent import Step, descend
+from jaxmap.tuning.evidence_cache import CacheRecipe, build_cache, tunable_labels
 from jaxmap.tuning.parametrisation import TunedParams, to_free, to_legal
 from jaxmap.tuning.traverse_loss import (
     Traverse,
@@ -35,64 +32,10 @@ from jaxmap.tuning.traverse_loss import (
     traverse_losses,
 )
 from jaxmap.tuning_config import tuned_tree
+from jaxmap.tuning_plan import Source, TuneOptions, plain, plan_tuning
 
 SOFT_START_M = 0.03
 """Where the width of the plane's threshold starts when the settings have a sharp one, which nothing can move."""
-
-MAX_KERNEL = 9
-
-
-@dataclass(frozen=True)
-class TuneOptions:
-    """How fusion is tuned.
-
-    Attributes:
-        descent: of the gradient.
-        loss: what is descended.
-        frozen: names of parameters that stay as they are.
-        cell_size_m: edge of the cells that are scored.
-        held_out_share: of the ground, kept from the descent and used to stop it.
-        block_px: see `evidence_cache.BLOCK_PX`.
-        seed: of what is held out, and of the bootstrap.
-        kernel: size of a kernel over neighbouring columns, learnt in a second descent; 0 for none.
-    """
-
-    descent: DescentOptions = field(default_factory=DescentOptions)
-    loss: LossOptions = field(default_factory=LossOptions)
-    frozen: tuple[str, ...] = ()
-    cell_size_m: float = 0.2
-    held_out_share: float = 0.25
-    block_px: int = BLOCK_PX
-    seed: int = 0
-    kernel: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuses what makes no sense."""
-        if self.kernel and (self.kernel % 2 == 0 or not 3 <= self.kernel <= MAX_KERNEL):
-            raise UsageError(f"kernel is {self.kernel}", where="tuning", fix=f"give an odd size from 3 to {MAX_KERNEL}")
-        if not 0 < self.held_out_share < 1:
-            raise UsageError(
-                f"held_out_share is {self.held_out_share}", where="tuning", fix="give a share between 0 and 1"
-            )
-        if not 0 < self.loss.rock_fraction <= 1:
-            raise UsageError(
-                f"rock_fraction is {self.loss.rock_fraction}", where="tuning", fix="give a share above 0, at most 1"
-            )
-        for name, value in (("class_weight", self.loss.class_weight), ("cell_size_m", self.cell_size_m)):
-            if not 0 < value < math.inf:
-                raise UsageError(f"{name} is {value}", where="tuning", fix="give a number above 0")
-        if not 0 <= self.loss.soft_iou < math.inf:
-            raise UsageError(f"iou_weight is {self.loss.soft_iou}", where="tuning", fix="give a number from 0 on")
-
-
-@dataclass(frozen=True)
-class Source:
-    """A sequence and its ground truth; labels and poses where they are its own."""
-
-    sequence: str
-    truth: Path
-    labels: Path | None = None
-    poses: Path | None = None
 
 
 class TuningRun:
@@ -119,28 +62,8 @@ class TuningRun:
     ) -> None:
         self._truth, self._options, self._out, self._tell = truth, options, out, tell
         self._sources = sources
-        self._plans: list[Plan] = []
-        for source in sources:
-            mine = replace(config, labels=source.labels or config.labels, poses=source.poses or config.poses)
-            plan = plan_run(source.sequence, mine, tell)
-            if not self._plans:
-                # What a sequence leaves open is decided once: the numbers hold for these voxels and this range.
-                config = _decided(config, plan)
-            self._plans.append(plan)
-        self._config = config
-        classes = self._plans[0].labeller.classes
-        if truth.target not in classes:
-            raise UsageError(
-                f"the map has no class {truth.target!r}: its classes are {' '.join(classes) or 'none'}",
-                where="--class",
-                fix="name one of them, or choose another --labeller",
-            )
-        self._target = classes.index(truth.target)
-        names = plain(self._start())
-        if unknown := [name for name in options.frozen if name not in names]:
-            raise UsageError(
-                f"no parameter {', '.join(unknown)}", where="--frozen", fix=f"name some of {' '.join(names)}"
-            )
+        plan = plan_tuning(sources, config, truth.target, options, tell)
+        self._config, self._plans, self._target, self._start = plan
         self.frames = sum(len(plan.sequence.frames) for plan in self._plans)
         self._traverses: list[Traverse] = []
 
@@ -202,7 +125,7 @@ class TuningRun:
         Raises:
             JaxmapError: the loss diverges, or writing failed; what was best before is kept.
         """
-        before = start = self._start()
+        before = start = self._start
         if start.labeller.get("softness_m") == 0.0:
             start = start._replace(labeller=start.labeller | {"softness_m": jnp.asarray(SOFT_START_M)})
         stages = [self._stage("tuned", before, start, advance)]
@@ -225,6 +148,7 @@ class TuningRun:
             "traverses": self._told_traverses(),
             "before": plain(before),
             "stages": [stage.told for stage in stages],
+            "notes": [note for stage in stages for note in descent_notes(stage.told)],
         }
         write_json(self._out.with_suffix(".json"), result)
         with atomic_path(self._out.with_suffix(".html")) as temporary:
@@ -276,13 +200,6 @@ class TuningRun:
             for plan, source, one in zip(self._plans, self._sources, self._traverses, strict=True)
         ]
 
-    def _start(self) -> TunedParams:
-        plan = self._plans[0]
-        numbers = tunable_labels(plan.labeller, plan.rule).numbers
-        return TunedParams(
-            plan.params.fusion, {name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()}
-        )
-
     def _moves(self, free: TunedParams) -> TunedParams:
         """1 for what moves, 0 for what is frozen or acts on nothing under the rule."""
 
@@ -294,10 +211,10 @@ class TuningRun:
         return TunedParams(replace(free.fusion, **fusion), labeller)
 
     def _write_config(self, params: TunedParams) -> None:
-        write_yaml(self._out, tuned_tree(self._config, params))
         # Scores and page of an earlier run are of other numbers; those of this one come at its end.
         for suffix in (".json", ".html"):
             remove(self._out.with_suffix(suffix))
+        write_yaml(self._out, tuned_tree(self._config, params))
 
     def _part(self, cells: list[ScoredCells], held_out: bool) -> ScoredCells:
         """Of the cells of all traverses, those that are held out, or those tuned on."""
@@ -315,12 +232,24 @@ class _Stage(NamedTuple):
     told: dict[str, Any]
 
 
-def plain(params: TunedParams) -> dict[str, Any]:
-    """Parameters as plain numbers by name; priors are log-odds, as the filter holds them."""
-    values = {**asdict(params.fusion), **params.labeller}
-    return {
-        name: np.asarray(value, np.float64).round(6).tolist() for name, value in values.items() if value is not None
-    }
+def descent_notes(stage: Mapping[str, Any]) -> list[str]:
+    """What is to be said of a descent that led nowhere; of one that led somewhere, nothing.
+
+    Args:
+        stage: as the JSON of `jaxmap tune` has it.
+    """
+    first, last = stage["history"][0], stage["history"][-1]
+    grown = last["loss"] > first["loss"]
+    if stage["best_step"] and not grown:
+        return []
+    course = f"the loss went from {first['loss']:.3f} to {last['loss']:.3f} in {last['step']} steps"
+    advice = ": take a lower --learning-rate" if grown else ""
+    if stage["best_step"]:
+        return [f"{stage['name']}: {course}, and what is kept is of step {stage['best_step']}{advice}"]
+    return [
+        f"{stage['name']}: nothing better than the start was found on the held-out ground, whose numbers are kept; "
+        f"{course}{advice}"
+    ]
 
 
 def _hard(params: TunedParams) -> TunedParams:
@@ -328,14 +257,3 @@ def _hard(params: TunedParams) -> TunedParams:
     if params.labeller.get("softness_m") == 0.0:
         return params._replace(labeller=params.labeller | {"softness_m": jnp.asarray(1e-5)})
     return params
-
-
-def _decided(config: MapConfig, plan: Plan) -> MapConfig:
-    """The settings with voxels and range as the first sequence has them."""
-    size_m = tuple(float(edge) for edge in np.asarray(plan.grid.voxel_size_m, np.float64).round(6))
-    return replace(
-        config,
-        classes=plan.labeller.classes or None,
-        grid=replace(config.grid, voxel_size_m=size_m),
-        depth=replace(config.depth, min_m=plan.depth_range_m[0], max_m=plan.depth_range_m[1]),
-    )

@@ -28,7 +28,8 @@ from jaxmap.evaluation.map_scores import confusion_scores
 from jaxmap.map_evaluation import TruthOptions, read_truth
 from jaxmap.mapping_plan import plan_run
 from jaxmap.sequence import PreparedFrame, prepare_frames
-from jaxmap.tuning_run import Source, TuneOptions, TuningRun
+from jaxmap.tuning_plan import Source, TuneOptions
+from jaxmap.tuning_run import TuningRun
 
 LABELS = {"true": "files", "deeplab": "deeplab", "plane": "plane"}
 CELL_M, RANGE_M = 0.2, 8.0

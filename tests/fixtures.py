@@ -5,7 +5,9 @@ Import them by name into a test module. They are made once for the whole session
 
 from __future__ import annotations
 
+import importlib
 import os
+import re
 import shutil
 from collections.abc import Callable
 from functools import cache
@@ -13,9 +15,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+import tyro
 from scenes import write_folder_sequence
 
 from jaxmap.cli import main
+from jaxmap.commands import COMMANDS
 
 FRAMES = 6
 
@@ -68,17 +72,44 @@ def scene_copy(scene_folder: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def cli(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs a command in this process."""
+    """Runs a command in this process; what it tells may name no option that the command has not."""
 
     def run(*words: object) -> Outcome:
         capsys.readouterr()
         try:
             status = main([str(word) for word in words])
         except SystemExit as stop:
-            status = stop.code if isinstance(stop.code, int) else 1
-        return Outcome(status, *capsys.readouterr())
+            return Outcome(stop.code if isinstance(stop.code, int) else 1, *capsys.readouterr())
+        outcome = Outcome(status, *capsys.readouterr())
+        if words and words[0] in COMMANDS:
+            assert not unknown_options(outcome.err, str(words[0])), outcome.err
+        return outcome
 
     return run
+
+
+def unknown_options(text: str, command: str) -> set[str]:
+    """The options named in what a command tells that it has not; after `jaxmap OTHER`, those that OTHER has not."""
+    unknown = set()
+    for line in text.splitlines():
+        first, *others = re.split(rf"\bjaxmap (?=(?:{'|'.join(COMMANDS)})\b)", line)
+        for asked, part in [(command, first), *((other.split()[0].strip("`.,;:"), other) for other in others)]:
+            unknown |= named_options(part) - options_of(asked)
+    return unknown
+
+
+def named_options(text: str) -> set[str]:
+    """The options that a text names."""
+    return set(re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", text))
+
+
+@cache
+def options_of(command: str) -> frozenset[str]:
+    """The options of a command, as its help shows them, and the one that every command takes."""
+    module = importlib.import_module(f"jaxmap.commands.{command}")
+    kinds = [kind for name, kind in vars(module).items() if name.endswith("Arguments")]
+    actions = [action for kind in kinds for action in tyro.extras.get_parser(kind)._actions]
+    return frozenset(option for action in actions for option in action.option_strings) | {"--debug"}
 
 
 def map_words(sequence: object, out: object, *more: object) -> list[str]:

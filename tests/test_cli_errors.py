@@ -6,22 +6,35 @@ writes them anew.
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from faults import MAP_FAULTS, nan_pose, truncated
-from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
+from fixtures import (
+    cli,  # noqa: F401
+    finished_run,  # noqa: F401
+    map_words,
+    named_options,
+    options_of,
+    scene_copy,  # noqa: F401
+    scene_folder,  # noqa: F401
+    shared_cache,  # noqa: F401
+    unknown_options,
+)
 from network_faults import IMPORT_FAULTS, SEGMENT_FAULTS, segment_words, write_inputs
 from training_data import CLASSES, TRAIN_FAULTS, write_data
 from tune_faults import TUNE_FAULTS
 
 import jaxmap
+from jaxmap.commands import COMMANDS
 
 SNAPSHOT = Path(__file__).parent / "snapshots" / "cli_errors.txt"
 
@@ -297,6 +310,29 @@ def test_an_interrupt_is_one_line(cli, scene_folder, tmp_path, monkeypatch):
     outcome = cli(*map_words(scene_folder, tmp_path / "run"))
     assert outcome.status == 130
     assert outcome.error == "interrupted"
+
+
+def raised_texts() -> Iterator[tuple[Path, str]]:
+    """Every text that is handed to an error."""
+    for path in Path(jaxmap.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("Error"):
+                parts = (part.value for part in ast.walk(node) if isinstance(part, ast.Constant))
+                yield from ((path, part) for part in parts if isinstance(part, str))
+
+
+def test_an_error_names_only_options_that_some_command_has():
+    known = frozenset().union(*map(options_of, COMMANDS))
+    named = [(path.name, option) for path, text in raised_texts() for option in named_options(text)]
+    assert len(named) > 50
+    assert [one for one in named if one[1] not in known] == []
+
+
+def test_options_of_another_command_are_found():
+    assert unknown_options("error: no codes; name them: --remap 1=sand", "train") == {"--remap"}
+    assert not unknown_options("error: no codes; name them: --map-truth.remap 1=sand", "train")
+    assert not unknown_options("error: no CRS; say it with jaxmap map --crs", "evaluate")
+    assert unknown_options("error: no CRS; say it with jaxmap map --remap", "evaluate") == {"--remap"}
 
 
 def as_program(*words: object) -> subprocess.CompletedProcess[str]:

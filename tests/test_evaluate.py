@@ -105,6 +105,24 @@ def test_a_real_run_is_scored_in_its_report(cli, finished_run, tmp_path):
     assert "scores.json could not be read" in (run / "report.html").read_text()
 
 
+def test_inputs_are_not_overwritten(cli, run, tmp_path):
+    truth, picture = truth_file(tmp_path), tmp_path / "mine_errors.png"
+    for path in (picture, run / "metrics.json"):
+        path.write_text("mine")
+    for words in (("--out", tmp_path / "mine.json", "--backdrop", picture), ("--out", run / "metrics.json")):
+        outcome = cli("evaluate", run, truth, *words)
+        assert (outcome.status, "an input would be overwritten" in outcome.error) == (2, True)
+    assert picture.read_text() == (run / "metrics.json").read_text() == "mine"
+    assert not (tmp_path / "mine.json").exists()
+
+
+def test_a_map_without_a_system_is_told_where_it_gets_one(cli, tmp_path):
+    rock = np.zeros((4, 4), bool)
+    run = write_map(tmp_path / "run", rock, ~rock, crs=None)
+    outcome = cli("evaluate", run, truth_file(tmp_path))
+    assert (outcome.status, "the map has no CRS, say it with jaxmap map --crs" in outcome.error) == (1, True)
+
+
 def test_the_error_map_shows_each_verdict_in_its_place(run, tmp_path):
     from jaxmap.evaluation.evaluate import ScoringOptions
     from jaxmap.map_evaluation import TruthOptions, evaluate_run

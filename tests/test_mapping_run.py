@@ -15,15 +15,17 @@ from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_fol
 from PIL import Image
 from scenes import BASELINE_M, BOXES_M, ROCK, SAND, frame_name, pose, scene_frame, timestamp_s, write_folder_sequence
 
+import jaxmap.mapping_grid
 from jaxmap.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import stored_fusion
-from jaxmap.geometry.bounds import map_bytes
+from jaxmap.geometry.bounds import grid_around_views, map_bytes
 from jaxmap.map_store import load_map
 from jaxmap.mapping import run_plan
-from jaxmap.mapping_plan import DEFAULT_VOXELS_M, Plan, plan_run
+from jaxmap.mapping_grid import DEFAULT_VOXELS_M
+from jaxmap.mapping_plan import Plan, plan_run
 from jaxmap.run_folder import RunFolder
 from jaxmap.sequence import prepare_frames
 
@@ -210,6 +212,20 @@ def test_voxels_of_no_given_size_are_the_finest_that_fit(scene_folder, fitting):
     limit_gib = map_bytes(fine[fitting], 3) / 2**30
     plan = planned(scene_folder, grid={"max_memory_gib": limit_gib})
     np.testing.assert_allclose(plan.grid.voxel_size_m, DEFAULT_VOXELS_M[fitting], atol=1e-6)
+
+
+def test_no_grid_is_made_that_is_not_needed(scene_folder, monkeypatch):
+    made = []
+
+    def counted(*words):
+        made.append(grid_around_views(*words))
+        return made[-1]
+
+    monkeypatch.setattr(jaxmap.mapping_grid, "grid_around_views", counted)
+    plan = planned(scene_folder)
+    assert len(made) == 1
+    planned(scene_folder, grid={"max_memory_gib": map_bytes(plan.grid, 3) / 2**30 / 2})
+    assert len(made) == 1 + 2
 
 
 def test_the_paper_preset_and_an_override(cli, scene_folder, tmp_path):

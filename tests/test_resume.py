@@ -6,20 +6,16 @@ import errno
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
+from killed import kill_when
 from scenes import write_folder_sequence
 from test_mapping_run import config_of, log_odds, metrics_of, planned
 
-import jaxmap
 from jaxmap import map_store
 from jaxmap.errors import JaxmapError
 from jaxmap.map_store import load_map
@@ -124,20 +120,7 @@ def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_p
     )
     run = tmp_path / "run"
     words = map_words(scene_folder, run, "--checkpoint-every-s", "0")
-    environment = {**os.environ, "PYTHONPATH": str(Path(jaxmap.__file__).parents[1])}
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *words], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    try:
-        deadline_s = time.monotonic() + 120
-        while not _saved_frames(run) >= 2:
-            assert process.poll() is None, "the run ended before it could be killed"
-            assert time.monotonic() < deadline_s
-            time.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
-    finally:
-        process.kill()
-        process.wait()
+    kill_when(lambda: _saved_frames(run) >= 2, program, words)
     assert 2 <= _saved_frames(run) < FRAMES
     assert not (run / "metrics.json").exists()
     assert cli(*map_words(scene_folder, run, "--resume")).status == 0

@@ -13,7 +13,8 @@ import rasterio
 import yaml
 from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 
-from jaxmap.files import atomic_path
+from jaxmap.errors import JaxmapError
+from jaxmap.files import atomic_path, bundled, remove
 from jaxmap.map_store import load_map
 from jaxmap.mapping import run_plan
 from jaxmap.run_folder import RunFolder
@@ -68,6 +69,7 @@ def test_overwriting_keeps_pictures_that_are_not_the_runs(cli, scene_folder, fin
 
 def test_two_runs_do_not_share_a_folder(cli, scene_folder, tmp_path):
     run = tmp_path / "run"
+    run.mkdir()
     with RunFolder(run).locked():
         outcome = cli(*map_words(scene_folder, run))
     assert outcome.status == 1
@@ -134,6 +136,28 @@ def test_what_ends_a_job_is_told_like_ctrl_c(cli, scene_folder, tmp_path):
     assert cli(*map_words(scene_folder, tmp_path / "run", "--stop", "1", "--labeller", "none")).status == 0
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGTERM)
+
+
+def test_what_cannot_be_removed_is_told(tmp_path):
+    (tmp_path / "full").mkdir()
+    with pytest.raises(JaxmapError, match="writing failed|no permission to write") as caught:
+        remove(tmp_path / "full")
+    assert caught.value.where == str(tmp_path / "full") and caught.value.fix
+    (tmp_path / "file").touch()
+    for _ in range(2):
+        remove(tmp_path / "file")
+    assert [path.name for path in tmp_path.iterdir()] == ["full"]
+
+
+@pytest.mark.parametrize("option", ["--calibration", "--model"])
+def test_inputs_in_use_are_not_overwritten(option, cli, scene_folder, tmp_path):
+    mine = tmp_path / "config.yaml"
+    given = bundled("rover.safetensors") if option == "--model" else scene_folder / "camera.yaml"
+    mine.write_bytes(given.read_bytes())
+    more = ("--labeller", "deeplab") if option == "--model" else ()
+    outcome = cli(*map_words(scene_folder, tmp_path, option, mine, *more, "--overwrite"))
+    assert (outcome.status, "an input would be overwritten" in outcome.error) == (2, True)
+    assert mine.read_bytes() == given.read_bytes() and len(list(tmp_path.iterdir())) == 1
 
 
 def test_what_killed_writers_left_is_removed(tmp_path):

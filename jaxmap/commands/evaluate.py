@@ -10,7 +10,8 @@ from typing import Annotated
 import tyro
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.errors import JaxmapError, UsageError, options_as
+from jaxmap.output_folder import check_inputs_stay
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
 
 
@@ -62,17 +63,10 @@ RANKING_COLUMNS = {"by": "missed, by", **MISSED_COLUMNS}
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(EvaluateArguments, "evaluate", words)
-    if not arguments.ground_truth:
-        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
-    if arguments.remap and arguments.palette is not None:
-        raise UsageError("--remap and --palette exclude each other", fix="give one of them")
-    if arguments.out is not None and arguments.out.suffix.lower() != ".json":
-        raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
-    if min(arguments.rock_diameters_m) <= 0:
-        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
+    _check(arguments)
 
     from jaxmap.cache import keep_compiled_programs
-    from jaxmap.datasets.label_coding import DEFAULT_CODING, parse_coding, read_coding
+    from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.datasets.rock_list import SIZE_CLASSES
     from jaxmap.evaluation.evaluate import ScoringOptions
     from jaxmap.map_evaluation import TruthOptions, evaluate_run, summary, write_evaluation
@@ -80,29 +74,30 @@ def main(words: Sequence[str]) -> int:
 
     keep_compiled_programs()
     console = Console()
-    coding = DEFAULT_CODING
-    if arguments.remap:
-        coding = parse_coding(arguments.remap)
-    elif arguments.palette is not None:
-        coding = read_coding(arguments.palette)
-    diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
-    evaluation, class_map = evaluate_run(
-        arguments.run,
-        arguments.ground_truth,
-        TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m),
-        ScoringOptions(
-            cell_size_m=arguments.cell_size_m,
-            rock_fraction=arguments.rock_fraction,
-            max_range_m=arguments.max_range_m,
-            register=arguments.register,
-            found_share=arguments.found_share,
-        ),
-    )
-    scores = evaluation.scores
     folder = RunFolder(arguments.run)
     out, picture = folder.scores, folder.errors
     if arguments.out is not None:
         out, picture = arguments.out, arguments.out.with_name(f"{arguments.out.stem}_errors.png")
+    read = (arguments.backdrop, arguments.palette, *arguments.ground_truth, folder.metrics, folder.poses)
+    check_inputs_stay((out, picture), read)
+    diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
+    coding = choose_coding(arguments.remap, arguments.palette)
+    options = ScoringOptions(
+        cell_size_m=arguments.cell_size_m,
+        rock_fraction=arguments.rock_fraction,
+        max_range_m=arguments.max_range_m,
+        register=arguments.register,
+        found_share=arguments.found_share,
+    )
+    # The system of a map is that of the poses it was made of.
+    with options_as(lambda option: "jaxmap map --crs" if option == "--crs" else option):
+        evaluation, class_map = evaluate_run(
+            arguments.run,
+            arguments.ground_truth,
+            TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m),
+            options,
+        )
+    scores = evaluation.scores
     write_evaluation(out, picture, evaluation, class_map, arguments.backdrop)
     for note in scores["notes"]:
         console.tell(f"note: {note}")
@@ -112,6 +107,15 @@ def main(words: Sequence[str]) -> int:
         names += _report_anew(console, arguments.run)
     console.result(out.parent, names)
     return 0
+
+
+def _check(arguments: EvaluateArguments) -> None:
+    if not arguments.ground_truth:
+        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
+    if arguments.out is not None and arguments.out.suffix.lower() != ".json":
+        raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
+    if min(arguments.rock_diameters_m) <= 0:
+        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
 
 
 def _report_anew(console: Console, run: Path) -> list[str]:

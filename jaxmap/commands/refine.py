@@ -68,6 +68,10 @@ class RefineArguments:
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631."""
+    remap: tuple[str, ...] = ()
+    """What the values of the orthomosaic mean: 0=unlabelled 7=rock '*=sand', or colours: '#b23c2e=rock'."""
+    palette: Path | None = None
+    """The same as a YAML file of CODE: CLASS."""
     truth_crs: str | None = None
     """Coordinate reference system of the ground truth, in place of its own."""
     max_pose_gap_s: float = 1.0
@@ -78,6 +82,8 @@ class RefineArguments:
     """Frame to stop before, from the end if negative; by default the end."""
     stride: int = 1
     """Take every so many frames."""
+    overwrite: bool = False
+    """Replace a refinement that lies in the folder."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -87,6 +93,7 @@ def main(words: Sequence[str]) -> int:
 
     from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets import ReadOptions
+    from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.map_evaluation import TruthOptions
     from jaxmap.refine_folder import CALIBRATION, OUTPUTS, check_apart
     from jaxmap.refine_run import GroundFiles, run_refine
@@ -106,10 +113,10 @@ def main(words: Sequence[str]) -> int:
         stop=arguments.stop,
         stride=arguments.stride,
     )
-    files = GroundFiles(
-        arguments.ground_truth, TruthOptions(crs=arguments.truth_crs), arguments.dem, arguments.ground_below_camera_m
-    )
-    check_apart(arguments.sequence, arguments.out, options)
+    inputs = (arguments.poses, arguments.calibration, arguments.dem, arguments.palette, *arguments.ground_truth)
+    check_apart(arguments.sequence, arguments.out, inputs)
+    truth = TruthOptions(coding=choose_coding(arguments.remap, arguments.palette), crs=arguments.truth_crs)
+    files = GroundFiles(arguments.ground_truth, truth, arguments.dem, arguments.ground_below_camera_m)
     with console.steps("refining", "steps", 100) as advance:
         content = run_refine(
             arguments.sequence,
@@ -118,6 +125,7 @@ def main(words: Sequence[str]) -> int:
             _prior(arguments),
             files,
             max_depth_m=arguments.max_depth_m,
+            overwrite=arguments.overwrite,
             advance=lambda share, note: advance(round(100 * share), note),
             tell=console.tell,
         )

@@ -60,14 +60,15 @@ def main(words: Sequence[str]) -> int:
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
-    if config.supervision == "map":
-        plan = plan_map_training(str(arguments.data_folder), config, arguments.init, tell=console.tell)
-    elif config.ground_truth is not None:
+    if config.supervision == "pixels" and config.ground_truth is not None:
         raise UsageError("--ground-truth is given, but pixels supervise", fix="add --supervision map, or leave it out")
-    else:
-        plan = plan_training(arguments.data_folder, config, arguments.init, tell=console.tell)
     folder = TrainingFolder(arguments.out)
+    # All data are read for the plan: a folder that cannot be written is told before.
     with locked(arguments.out):
+        if config.supervision == "map":
+            plan = plan_map_training(str(arguments.data_folder), config, arguments.init, tell=console.tell)
+        else:
+            plan = plan_training(arguments.data_folder, config, arguments.init, tell=console.tell)
         folder.begin(plan, resume=arguments.resume, overwrite=arguments.overwrite)
         with console.steps("training", "steps", plan.order.steps) as advance:
             metrics = TrainingRun(plan, folder, tell=console.tell, on_step=advance).run()

@@ -13,6 +13,7 @@ import tyro
 from jaxmap.commands.console import Console, parse
 from jaxmap.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.errors import UsageError
+from jaxmap.output_folder import check_inputs_stay
 
 
 @dataclass(frozen=True)
@@ -77,20 +78,17 @@ def main(words: Sequence[str]) -> int:
     _check(arguments, config)
 
     from jaxmap.cache import keep_compiled_programs
-    from jaxmap.datasets.label_coding import DEFAULT_CODING, parse_coding, read_coding
+    from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.map_evaluation import TruthOptions
+    from jaxmap.output_folder import locked
     from jaxmap.tuning.descent import DescentOptions
     from jaxmap.tuning.map_loss import LossOptions
-    from jaxmap.tuning_run import Source, TuneOptions, TuningRun
+    from jaxmap.tuning_plan import Source, TuneOptions
+    from jaxmap.tuning_run import TuningRun
 
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
-    coding = DEFAULT_CODING
-    if arguments.remap:
-        coding = parse_coding(arguments.remap)
-    elif arguments.palette is not None:
-        coding = read_coding(arguments.palette)
     count = len(arguments.sequence)
     rows = zip(
         arguments.sequence,
@@ -111,16 +109,19 @@ def main(words: Sequence[str]) -> int:
     run = TuningRun(
         [Source(*row) for row in rows],
         config,
-        TruthOptions(arguments.target, coding, arguments.truth_crs),
+        TruthOptions(arguments.target, choose_coding(arguments.remap, arguments.palette), arguments.truth_crs),
         options,
         arguments.out,
         tell=console.tell,
     )
-    with console.steps("reading", "frames", run.frames) as advance:
-        run.cache(advance)
-    with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
-        result = run.tune(advance)
+    with locked(arguments.out.parent):
+        with console.steps("reading", "frames", run.frames) as advance:
+            run.cache(advance)
+        with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
+            result = run.tune(advance)
     _print(console, result)
+    for note in result["notes"]:
+        console.tell(f"note: {note}")
     out = arguments.out
     console.result(out.parent, [out.name, out.with_suffix(".json").name, out.with_suffix(".html").name])
     return 0
@@ -143,18 +144,15 @@ def _check(arguments: TuneArguments, config: MapConfig) -> None:
             )
     if arguments.out.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError(f"--out {arguments.out} is not a .yaml file", fix="name a YAML file")
-    if arguments.remap and arguments.palette is not None:
-        raise UsageError("--remap and --palette exclude each other", fix="give one of them")
-    inputs = (config.poses, config.calibration, arguments.palette, *arguments.poses_of)
-    if arguments.out.resolve() in {path.resolve() for path in inputs if path is not None}:
-        raise UsageError("an input would be overwritten", where=arguments.out, fix="choose another --out")
-    there = [path for suffix in ("", ".json", ".html") if (path := _beside(arguments.out, suffix)).exists()]
+    outputs = [arguments.out, *(arguments.out.with_suffix(suffix) for suffix in (".json", ".html"))]
+    start = None if arguments.config is None else Path(arguments.config)
+    given = (start, arguments.palette, *arguments.poses_of, *arguments.ground_truth)
+    check_inputs_stay(outputs, (config.poses, config.calibration, config.model, *given))
+    if folders := [path for path in outputs if path.is_dir()]:
+        raise UsageError("cannot be written: it is a folder", where=folders[0], fix="choose another --out")
+    there = [path for path in outputs if path.exists()]
     if there and not arguments.overwrite:
         raise UsageError("there already", where=there[0], fix="choose another --out, or add --overwrite")
-
-
-def _beside(out: Path, suffix: str) -> Path:
-    return out.with_suffix(suffix) if suffix else out
 
 
 def _print(console: Console, result: dict) -> None:

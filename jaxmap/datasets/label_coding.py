@@ -110,6 +110,19 @@ def read_coding(path: Path) -> LabelCoding:
     return make_coding(tree, path)
 
 
+def choose_coding(remap: Sequence[str], palette: Path | None, where: object = "--remap") -> LabelCoding:
+    """The coding that words (`parse_coding`) or a file (`read_coding`) give; the usual one where neither is given.
+
+    Raises:
+        UsageError: both are given, or what the two refuse.
+    """
+    if remap and palette is not None:
+        raise UsageError("--remap and --palette exclude each other", fix="give one of them")
+    if palette is not None:
+        return read_coding(palette)
+    return parse_coding(remap, where) if remap else DEFAULT_CODING
+
+
 def decode(
     codes: Int[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], coding: LabelCoding, target: str, where: object
 ) -> UInt8[np.ndarray, "H W"]:

@@ -42,8 +42,8 @@ def write_refine_report(out: Path, name: str, state: Refinement, content: dict[s
         _picture(out / SPREAD, "How much frames differ in the height of a column, before and after"),
         _picture(out / TRAJECTORY, "The cameras from above and from the side, before and after"),
         _curve(state),
-        _parameters("What was refined", content["parameters"], with_value=True),
-        _parameters("The map as a whole", content["whole_map"], with_value=True),
+        _parameters("What was refined", content["parameters"]),
+        _parameters("The map as a whole", content["whole_map"]),
         _frames(content),
         _notes(content),
     ]
@@ -95,7 +95,7 @@ def _curve(state: Refinement) -> str:
     return f'<section><h2>Residual</h2><div class="tables"><figure>{drawn}</figure></div></section>'
 
 
-def _parameters(title: str, rows: list[dict[str, Any]], *, with_value: bool) -> str:
+def _parameters(title: str, rows: list[dict[str, Any]]) -> str:
     if not rows:
         return ""
     head = "".join(f'<th scope="col">{name}</th>' for name in ("", "found", "± 1 σ", "given ± 1 σ", "told by the data"))

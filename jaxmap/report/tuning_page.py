@@ -42,6 +42,7 @@ def tuning_page(title: str, result: Mapping[str, Any]) -> str:
         *(_stage(stage) for stage in result["stages"]),
         _parameters(result),
         _traverses(result["traverses"]),
+        _notes(result["notes"]),
         "<footer>Made by jaxmap.</footer>",
     ]
     return page(title, "".join(sections), drawn=False)
@@ -158,6 +159,11 @@ def _traverses(traverses: Sequence[Mapping[str, Any]]) -> str:
     head = "".join(f'<th scope="col">{name}</th>' for name in ("Sequence", "frames", "cells", "held out"))
     table = f'<div class="list"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     return f"<section><h2>Traverses</h2>{table}</section>"
+
+
+def _notes(notes: Sequence[str]) -> str:
+    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    return f"<section><h2>Notes</h2><ul>{items}</ul></section>" if items else ""
 
 
 def _text(value: float | None) -> str:

@@ -9,7 +9,14 @@ from rasterio.enums import ColorInterp
 from truth_files import CRS, SITE, class_map, write_raster
 
 from jaxmap.datasets.crs import Extent
-from jaxmap.datasets.label_coding import LabelCoding, make_coding, parse_coding, read_coding
+from jaxmap.datasets.label_coding import (
+    DEFAULT_CODING,
+    LabelCoding,
+    choose_coding,
+    make_coding,
+    parse_coding,
+    read_coding,
+)
 from jaxmap.datasets.orthomosaic import read_label_orthomosaic, read_picture
 from jaxmap.datasets.rock_list import draw_rocks, find_rock_lists, read_rock_lists
 from jaxmap.errors import JaxmapError, UsageError
@@ -216,6 +223,16 @@ def test_codings_from_files(tmp_path):
     with pytest.raises(UsageError, match="cannot be read"):
         read_coding(tmp_path)
     assert make_coding({"-1": "rock"}, "here").text() == "-1=rock"
+
+
+def test_words_or_a_file_choose_the_coding(tmp_path):
+    path = tmp_path / "palette.yaml"
+    path.write_text("0: unlabelled\n3: rock\n")
+    assert choose_coding((), None) == DEFAULT_CODING
+    assert choose_coding(["3=rock"], None) == LabelCoding({3: "rock"})
+    assert choose_coding((), path) == read_coding(path)
+    with pytest.raises(UsageError, match="exclude each other"):
+        choose_coding(["3=rock"], path)
 
 
 def test_rocks_are_discs_on_sand(tmp_path):

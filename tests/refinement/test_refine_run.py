@@ -11,14 +11,19 @@ import pytest
 import rasterio
 import yaml
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
+from html_tables import tables_of
+from killed import SLOW_DISK, fill_disk, kill_when
 from rasterio.transform import from_origin
 from refinement.synthetic import disturbed, pose_errors
 from scenes import BOXES_M, CAMERA, pose, timestamp_s
 from scipy.spatial.transform import Rotation
+from tune_faults import labels_from_above, write_truth
 
+import jaxmap.refine_run
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.calibration import read_camera_yaml, read_mounting, write_camera_yaml
 from jaxmap.datasets.pose_files import read_poses, write_tum
+from jaxmap.output_folder import locked
 from jaxmap.stereo.rectify import make_rectifier, make_stereo_rig
 
 FRAMES = 4
@@ -85,6 +90,16 @@ def test_the_results_tell_what_was_found(refined):
     assert "heading deg" in page
     assert 'class="chart"' in page and "svg.chart {" in page, "without its style, the curve is a black square"
     assert not (refined / "calibration.yaml").exists()
+    whole_map, frames = tables_of(page)
+    assert whole_map.headings == ["", "found", "± 1 σ", "given ± 1 σ", "told by the data"]
+    found = whole_map.row("up m")
+    assert found[-1] == "yes" and float(found[1]) == pytest.approx(whole["up_m"]["sigma"], rel=0.02)
+    assert float(found[2]) == pytest.approx(whole["up_m"]["prior_sigma"], rel=0.02)
+    assert frames.headings == ["Frame", "moved, m", "± m", "turned, deg", "± deg", "matched"]
+    moved, _, turned, _, matched = frames.row("f002")
+    assert float(moved) == pytest.approx(content["poses"]["moved_m"][2], rel=0.02)
+    assert float(turned) == pytest.approx(content["poses"]["turned_deg"][2], rel=0.02)
+    assert matched == "yes"
 
 
 def test_a_map_is_made_of_the_refined_poses(cli, refined, scene_folder, tmp_path):
@@ -183,6 +198,17 @@ def test_bad_input_is_told_in_one_line(cli, scene_folder, tmp_path):
     assert fault(cli, scene_folder, scene_folder, "--poses", scene_folder / "poses.tum")[0] == 2
 
 
+def test_what_an_orthomosaic_means_can_be_said(cli, scene_folder, tmp_path):
+    codes = np.array([0, 40, 200], np.uint8)[labels_from_above()]
+    truth = write_truth(tmp_path / "truth.tif", codes)
+    words = ("--ground-truth", truth, "--stop", 2, "--max-depth-m", 5)
+    status, error = fault(cli, scene_folder, tmp_path / "out", *words)
+    assert (status, "mean nothing" in error, "--remap" in error) == (1, True, True)
+    (tmp_path / "palette.yaml").write_text("0: unlabelled\n40: sand\n200: rock\n")
+    for more in (("--remap", "0=unlabelled", "40=sand", "200=rock"), ("--palette", tmp_path / "palette.yaml")):
+        assert cli("refine", scene_folder, "--out", tmp_path / more[0], *words, *more).status == 0
+
+
 def test_files_of_others_are_not_replaced(cli, scene_folder, tmp_path):
     page = tmp_path / "report.html"
     page.write_text("of a map")
@@ -192,12 +218,96 @@ def test_files_of_others_are_not_replaced(cli, scene_folder, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_an_earlier_calibration_does_not_lie_beside_new_poses(cli, scene_folder, tmp_path):
-    for name in ("refine.json", "calibration.yaml"):
-        (tmp_path / name).write_text("{}")
-    assert cli("refine", scene_folder, "--out", tmp_path, "--stop", 2, "--max-depth-m", 5).status == 0
-    assert json.loads((tmp_path / "refine.json").read_text())["frames"] == ["f000", "f001"]
-    assert not (tmp_path / "calibration.yaml").exists()
+def test_results_that_are_no_refinement_s_are_those_of_others(cli, scene_folder, tmp_path):
+    for text in ("{}", "[1]", "mine", "[" * 100_000):
+        (tmp_path / "refine.json").write_text(text)
+        status, error = fault(cli, scene_folder, tmp_path, "--stop", 2, "--overwrite")
+        assert (status, "no refinement has written" in error) == (1, True)
+        assert (tmp_path / "refine.json").read_text() == text
+
+
+def test_an_earlier_refinement_is_replaced_only_on_demand(cli, refined, scene_folder, tmp_path):
+    out = Path(shutil.copytree(refined, tmp_path / "out"))
+    # What an earlier refinement may have left, and what is the user's.
+    for name in ("calibration.yaml", "holiday.png"):
+        (out / name).write_text("{}")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    words = ("--stop", 2, "--max-depth-m", 5)
+    status, error = fault(cli, scene_folder, out, *words)
+    assert (status, "holds a refinement already" in error, "--overwrite" in error) == (1, True, True)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert cli("refine", scene_folder, "--out", out, *words, "--overwrite").status == 0
+    assert json.loads((out / "refine.json").read_text())["frames"] == ["f000", "f001"]
+    assert len(read_poses(out / "poses.tum").T) == 2
+    assert {path.name for path in out.iterdir()} == before.keys() - {"calibration.yaml"}
+
+
+def test_a_refinement_that_fails_leaves_the_earlier_one(cli, refined, scene_folder, tmp_path):
+    out = Path(shutil.copytree(refined, tmp_path / "out"))
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert fault(cli, scene_folder, out, "--stop", 1, "--overwrite")[0] == 1
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_two_runs_do_not_share_a_folder(cli, scene_folder, tmp_path):
+    out = tmp_path / "out"
+    with locked(out):
+        status, error = fault(cli, scene_folder, out, "--stop", 2)
+    assert (status, "another run is writing here" in error) == (1, True)
+    assert not out.exists(), "what was made for nothing is gone"
+
+
+def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(jaxmap.refine_run, "read_inputs", lambda *_: pytest.fail("it reads first"))
+    (tmp_path / "file").write_text("")
+    status, error = fault(cli, scene_folder, tmp_path / "file", "--stop", 2)
+    assert (status, "cannot be made: it is a file" in error) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ("--poses", "poses.tum"),
+        ("--calibration", "calibration.yaml"),
+        ("--palette", "calibration.yaml"),
+        ("--dem", "trajectory.png"),
+        ("--ground-truth", "consistency.png"),
+    ],
+)
+def test_an_input_is_not_overwritten(option, name, cli, scene_folder, tmp_path):
+    (tmp_path / name).write_text("mine")
+    status, error = fault(cli, scene_folder, tmp_path, option, tmp_path / name, "--overwrite")
+    assert (status, "an input would be overwritten" in error) == (2, True)
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["refine.json", "poses.tum", "trajectory.png"])
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(name, cli, scene_folder, tmp_path, monkeypatch):
+    out, words = tmp_path / "out", ("--stop", 2, "--max-depth-m", 5)
+    with monkeypatch.context() as patch:
+        fill_disk(patch, name)
+        status, error = fault(cli, scene_folder, out, *words)
+    assert (status, "disk full" in error) == (1, True)
+    order = ["refine.json", "poses.tum", "consistency.png", "trajectory.png", "report.html"]
+    left = sorted(path.name for path in out.iterdir()) if out.exists() else []
+    assert left == sorted(order[: order.index(name)])
+    if "poses.tum" in left:
+        assert len(read_poses(out / "poses.tum").T) == 2
+    assert cli("refine", scene_folder, "--out", out, *words, "--overwrite").status == 0
+    assert {path.name for path in out.iterdir()} == set(order), "no leftovers"
+
+
+def test_a_killed_process_leaves_nothing_half_written_and_is_begun_anew(cli, refined, scene_folder, tmp_path):
+    out = Path(shutil.copytree(refined, tmp_path / "out"))
+    words = ("refine", scene_folder, "--out", out, "--stop", 2, "--max-depth-m", 5)
+    kill_when(lambda: list(out.glob(".poses.tmp-*")), SLOW_DISK, (*words, "--overwrite"))
+    assert json.loads((out / "refine.json").read_text())["frames"] == ["f000", "f001"]
+    left = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+    assert left == {"refine.json"}, "nothing of the earlier refinement lies beside the results of this one"
+    assert cli(*words).status == 1, "it is not replaced unasked"
+    assert cli(*words, "--overwrite").status == 0
+    names = {"refine.json", "poses.tum", "consistency.png", "trajectory.png", "report.html"}
+    assert {path.name for path in out.iterdir()} == names, "no leftovers"
 
 
 def test_frames_that_share_nothing_are_told(cli, scene_folder, tmp_path):

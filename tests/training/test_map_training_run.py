@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scenes
 from fixtures import cli, shared_cache  # noqa: F401
+from killed import kill_when
 from tiny_training import ARCHITECTURE as TINY
 from tiny_training import network_is_tiny  # noqa: F401
 from truth_files import write_raster
@@ -122,6 +123,33 @@ def test_an_interrupted_run_goes_on_exactly(cli, finished, place, tmp_path, monk
     assert history_of(run) == history_of(finished)
 
 
+SLOWLY = """\
+import sys, time
+from jaxmap.training_log import Meter
+from tiny_training import main, tiny_network
+
+add = Meter.add
+def slowly(*words):
+    time.sleep(0.5)
+    return add(*words)
+Meter.add = slowly
+with tiny_network():
+    sys.exit(main(sys.argv[1:]))
+"""
+"""Each step takes a while, so that the process dies in the middle of the run."""
+
+
+def test_a_killed_process_is_gone_on_with(cli, finished, place, tmp_path):
+    run = tmp_path / "run"
+    kill_when(lambda: [path for path in run.glob("checkpoints/*") if path.name.isdecimal()], SLOWLY, words(place, run))
+    assert len(history_of(run)) < len(history_of(finished))
+    assert cli(*words(place, run)).status == 1, "it is not replaced unasked"
+    assert cli(*words(place, run, "--resume")).status == 0
+    assert (run / "model.safetensors").read_bytes() == (finished / "model.safetensors").read_bytes()
+    assert history_of(run) == history_of(finished)
+    assert {path.name for path in run.iterdir()} == {path.name for path in finished.iterdir()}, "no leftovers"
+
+
 def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(place):
     from jaxmap.map_training_plan import plan_map_training
     from jaxmap.training_config import load_train_config
@@ -145,11 +173,25 @@ FAULTS = {
     "no loss": (2, ("--loss.cross-entropy", "0", "--loss.soft-iou", "0"), "weight of 0"),
     "fixed copies": (2, ("--augmentation.copies", "3"), "is for images"),
     "an ensemble": (2, ("--mapping.ensemble.members", "2"), "mapping.ensemble.members says nothing"),
-    "another labeller": (2, ("--mapping.labels", "there"), "mapping.labels says nothing"),
+    "another labeller": (2, ("--mapping.labeller", "plane"), "mapping.labeller says nothing"),
+    "labels of others": (2, ("--mapping.labels", "there"), "mapping.labels says nothing"),
     "classes that the network has not": (2, ("--classes", "background", "mud", "rock"), "would be random"),
     "a truth of one known class": (2, ("--map-truth.remap", "1=mud", "2=rock"), "fewer than two classes"),
     "codes without a meaning": (1, ("--map-truth.remap", "1=sand", "3=rock"), "mean nothing"),
     "no such orthomosaic": (1, ("--ground-truth", "gone.tif"), "no such file"),
+    "codes that are told": (1, ("--map-truth.remap", "1=sand", "3=rock"), "name them all (--map-truth.remap "),
+    "a truth of another system": (
+        1,
+        ("--mapping.crs", "EPSG:32631", "--map-truth.crs", "EPSG:32633"),
+        "does not lie over the map",
+    ),
+    "no depth": (2, ("--mapping.depth.min-m", "9"), "set --mapping.depth.max-m"),
+    "too large a map": (
+        1,
+        ("--mapping.grid.max-memory-gib", "1e-5"),
+        "or raise --mapping.grid.max-memory-gib",
+    ),
+    "no poses": (1, ("--mapping.poses", "gone.tum"), "there is no file gone.tum"),
     "no frame to teach": (1, ("--data.validation-share", "0.95"), "held out"),
 }
 

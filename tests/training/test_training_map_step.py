@@ -12,6 +12,7 @@ import optax
 import pytest
 import scenes
 from hypothesis import given, settings
+from small_scenes import small_camera
 from strategies import rngs
 from tiny_training import ARCHITECTURE as TINY
 from tiny_training import network_is_tiny  # noqa: F401
@@ -25,19 +26,12 @@ from jaxmap.training.step import parted
 from jaxmap.tuning.frame_crops import FrameBatch
 from jaxmap.tuning.map_loss import LossOptions, MapTruth
 from jaxmap.tuning.map_step import SHOWN, MapTrainer, Site, anchor_loss, make_map_trainer
-from jaxmap.types import make_grid, make_stereo_camera
+from jaxmap.types import make_grid
 
 EVERY_PX = 2
 SAND, ROCK = ROVER_CLASSES.index("sand"), ROVER_CLASSES.index("rock")
 KEY = jax.random.key(5)
-CAMERA = make_stereo_camera(
-    fx_px=scenes.F_PX / EVERY_PX,
-    cx_px=scenes.CX_PX / EVERY_PX,
-    cy_px=scenes.CY_PX / EVERY_PX,
-    baseline_m=scenes.BASELINE_M,
-    width_px=scenes.WIDTH_PX // EVERY_PX,
-    height_px=scenes.HEIGHT_PX // EVERY_PX,
-)
+CAMERA = small_camera(EVERY_PX)
 GRID = make_grid([-2.0, 0.0, -0.4], [2.0, 5.2, 1.2], 0.2)
 OPTIONS = TrainingOptions(
     batch_size=2,

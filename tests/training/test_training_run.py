@@ -9,8 +9,6 @@ import math
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +17,7 @@ import jax
 import numpy as np
 import pytest
 from fixtures import cli, shared_cache  # noqa: F401
+from killed import kill_when
 from tiny_training import (  # noqa: F401
     CONFIG,
     EPOCHS,
@@ -31,7 +30,6 @@ from tiny_training import (  # noqa: F401
 )
 from training_data import CLASSES, change_mask, scene, write_pair
 
-import jaxmap
 from jaxmap.errors import JaxmapError
 from jaxmap.models.checkpoint import load_network
 from jaxmap.training.checkpoints import Checkpoints
@@ -213,24 +211,8 @@ with tiny_network():
 
 
 def test_a_killed_process_is_gone_on_with(plan, tiny_data, whole_run, tmp_path):
-    run, here = tmp_path / "run", Path(__file__).parent
-    folders = map(str, (Path(jaxmap.__file__).parents[1], here, here.parent))
-    process = subprocess.Popen(
-        [sys.executable, "-c", SLOWLY, *train_words(tiny_data, run)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(folders)},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        deadline_s = time.monotonic() + 300
-        while not saved_steps(run):
-            assert process.poll() is None, "the run ended before it could be killed"
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-    finally:
-        process.kill()
-        process.wait()
+    run = tmp_path / "run"
+    kill_when(lambda: saved_steps(run), SLOWLY, train_words(tiny_data, run))
     assert saved_steps(run)[-1] < STEPS
     go(plan, run, resume=True)
     same_run(run, whole_run)

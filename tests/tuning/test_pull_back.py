@@ -13,6 +13,7 @@ import pytest
 import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_scenes import small_camera
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
@@ -21,19 +22,12 @@ from jaxmap.labellers import make_files_labeller, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
 from jaxmap.tuning.pull_back import make_pull_back, map_gradient
-from jaxmap.types import Frame, VoxelMap, make_grid, make_stereo_camera
+from jaxmap.types import Frame, VoxelMap, make_grid
 
 EVERY_PX = 5
 """The scenes' pixels are taken so far apart: small frames of the same view."""
 
-CAMERA = make_stereo_camera(
-    fx_px=scenes.F_PX / EVERY_PX,
-    cx_px=scenes.CX_PX / EVERY_PX,
-    cy_px=scenes.CY_PX / EVERY_PX,
-    baseline_m=scenes.BASELINE_M,
-    width_px=scenes.WIDTH_PX // EVERY_PX,
-    height_px=scenes.HEIGHT_PX // EVERY_PX,
-)
+CAMERA = small_camera(EVERY_PX)
 GRID = make_grid([-2.0, 0.0, -0.4], [2.0, 5.0, 1.2], 0.2)
 DEPTH_RANGE_M = (0.3, 4.0)
 FUSION = make_fusion_params(ROVER_CLASSES, occupancy_prior=0.4, class_prior=[0.3, 0.5, 0.6])

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
+from html import escape
 
 import numpy as np
 import pytest
 import yaml
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
+from html_tables import tables_of
+from killed import SLOW_DISK, fill_disk, kill_when
 from tune_faults import tune_words, write_truth
 
+import jaxmap.output_folder
 import jaxmap.tuning_run
 from jaxmap.config import load_config
 from jaxmap.errors import JaxmapError
 from jaxmap.map_store import load_map
+from jaxmap.output_folder import locked
 from jaxmap.tuning.descent import Losses, Step
+from jaxmap.tuning_run import descent_notes
 
 SHORT = ("--steps", "6", "--held-out-share", "0.4")
 
@@ -41,6 +48,7 @@ def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
     assert np.shape(config.fusion.class_kernel) == (3, 3, 3)
 
     told = json.loads(out.with_suffix(".json").read_text())
+    assert told["notes"] == [note for one in told["stages"] for note in descent_notes(one)]
     assert [stage["name"] for stage in told["stages"]] == ["tuned", "with kernel"]
     for stage in told["stages"]:
         held_out = [row["held_out"] for row in stage["history"]]
@@ -50,6 +58,20 @@ def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
     assert told["before"]["occupancy_hit"] == pytest.approx(0.85)
 
     page = out.with_suffix(".html").read_text()
+    held_out, tuned_on, *_, numbers, traverses = tables_of(page)
+    assert held_out.headings == tuned_on.headings == ["", "before", "after", "change"]
+    row, scores = held_out.row("IoU"), told["stages"][0]["scores"]["held_out"]["iou"]
+    assert [text.split(" ")[0] for text in row] == [f"{scores[when]:.3f}" for when in ("before", "after", "change")]
+    assert numbers.headings == ["", "before", "tuned", "with kernel"]
+    first, *others = (told["before"], *(one["parameters"] for one in told["stages"]))
+    assert [float(text) for text in numbers.row("occupancy hit")] == pytest.approx(
+        [first["occupancy_hit"], *(one["occupancy_hit"] for one in others)], rel=0.01
+    )
+    assert traverses.headings == ["Sequence", "frames", "cells", "held out"]
+    (one,) = told["traverses"]
+    assert [int(text.replace(",", "")) for text in traverses.row(one["sequence"])] == [
+        one[key] for key in ("frames", "cells", "held_out_cells")
+    ]
     assert page.startswith("<!doctype html>")
     assert page.count("<svg") == 6
     assert not re.search(r'(src|href)="(?!data:|#)', page)
@@ -104,12 +126,91 @@ def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder
     assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
 
 
-def test_an_input_is_not_overwritten(cli, scene_folder, truth, tmp_path):
-    camera = tmp_path / "camera.yaml"
-    camera.write_bytes((scene_folder / "camera.yaml").read_bytes())
-    outcome = cli(*tune_words(scene_folder, truth, camera, *SHORT, "--overwrite", "--calibration", camera))
+def test_a_descent_that_leads_nowhere_is_told(cli, scene_folder, truth, tmp_path):
+    out = tmp_path / "fusion.yaml"
+    words = ("--steps", "6", "--held-out-share", "0.4", "--learning-rate", "100")
+    outcome = cli(*tune_words(scene_folder, truth, out, *words))
+    assert outcome.status == 0, outcome
+    (note,) = json.loads(out.with_suffix(".json").read_text())["notes"]
+    assert f"note: {note}" in outcome.err and "take a lower --learning-rate" in note
+    assert escape(note) in out.with_suffix(".html").read_text()
+
+
+def stage(best: int, *losses: float) -> dict:
+    history = [{"step": step, "loss": loss, "held_out": loss} for step, loss in enumerate(losses)]
+    return {"name": "tuned", "best_step": best, "history": history}
+
+
+def test_only_descents_that_lead_nowhere_are_told():
+    assert descent_notes(stage(2, 1.0, 0.9, 0.8)) == []
+    (stuck,) = descent_notes(stage(0, 1.0, 0.9))
+    assert "nothing better than the start" in stuck and "--learning-rate" not in stuck
+    (up,) = descent_notes(stage(0, 1.0, 9.0))
+    assert "nothing better than the start" in up and "from 1.000 to 9.000 in 1 steps: take a lower" in up
+    (past,) = descent_notes(stage(1, 1.0, 0.9, 5.0))
+    assert "what is kept is of step 1: take a lower --learning-rate" in past
+
+
+def test_two_runs_do_not_share_a_folder(cli, scene_folder, truth, tmp_path):
+    with locked(tmp_path):
+        outcome = cli(*tune_words(scene_folder, truth, tmp_path / "fusion.yaml", *SHORT))
+    assert (outcome.status, "another run is writing here" in outcome.error) == (1, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, truth, tmp_path, monkeypatch):
+    def refused(**_):
+        raise PermissionError(errno.EACCES, "refused")
+
+    monkeypatch.setattr(jaxmap.tuning_run.TuningRun, "cache", lambda *_: pytest.fail("it reads first"))
+    (tmp_path / "fusion.html").mkdir()
+    outcome = cli(*tune_words(scene_folder, truth, tmp_path / "fusion.yaml", *SHORT, "--overwrite"))
+    assert (outcome.status, "it is a folder" in outcome.error) == (2, True)
+    monkeypatch.setattr(jaxmap.output_folder, "TemporaryFile", refused)
+    outcome = cli(*tune_words(scene_folder, truth, tmp_path / "new" / "fusion.yaml", *SHORT))
+    assert (outcome.status, "no permission to write" in outcome.error) == (1, True)
+    assert not (tmp_path / "new").exists(), "nothing is left of it"
+
+
+@pytest.mark.parametrize(
+    ("option", "suffix"),
+    [(f"--{name}", "yaml") for name in ("calibration", "poses", "palette", "config")] + [("--poses-of", "json")],
+)
+def test_an_input_is_not_overwritten(option, suffix, cli, scene_folder, truth, tmp_path):
+    mine = tmp_path / f"mine.{suffix}"
+    mine.write_text("stride: 1")
+    words = (*SHORT, "--overwrite", option, mine)
+    outcome = cli(*tune_words(scene_folder, truth, tmp_path / "mine.yaml", *words))
     assert (outcome.status, "would be overwritten" in outcome.error) == (2, True)
-    assert camera.read_bytes() == (scene_folder / "camera.yaml").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == [mine.name] and mine.read_text() == "stride: 1"
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json", ".html"])
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+    suffix, cli, scene_folder, truth, tmp_path, monkeypatch
+):
+    out, words = tmp_path / "fusion.yaml", ("--steps", "1", "--held-out-share", "0.4")
+    with monkeypatch.context() as patch:
+        fill_disk(patch, f"fusion{suffix}")
+        outcome = cli(*tune_words(scene_folder, truth, out, *words))
+    assert (outcome.status, "disk full" in outcome.error) == (1, True)
+    order = [".yaml", ".json", ".html"]
+    assert {path.suffix for path in tmp_path.iterdir()} == set(order[: order.index(suffix)])
+    if suffix != ".yaml":
+        assert load_config(str(out)).fusion.class_increments is not None
+    assert cli(*tune_words(scene_folder, truth, out, *words, "--overwrite")).status == 0
+    assert {path.suffix for path in tmp_path.iterdir()} == set(order), "no leftovers"
+
+
+def test_a_killed_process_leaves_the_best_so_far_and_is_begun_anew(cli, scene_folder, truth, tmp_path):
+    out = tmp_path / "fusion.yaml"
+    words = tune_words(scene_folder, truth, out, *SHORT)
+    kill_when(lambda: out.exists() and list(tmp_path.glob(".fusion.tmp-*")), SLOW_DISK, words)
+    assert load_config(str(out)).fusion.class_increments is not None
+    assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
+    assert cli(*words).status == 2, "it is not replaced unasked"
+    assert cli(*words, "--overwrite").status == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"fusion.yaml", "fusion.json", "fusion.html"}
 
 
 def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, truth, tmp_path):
