@@ -24,4 +24,6 @@ def keep_compiled_programs() -> None:
         # Without a place to keep them, programs are compiled anew each time.
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    # All of them: a start compiles dozens of small programs, too, and each costs as much as a large one is to load.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

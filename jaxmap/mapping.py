@@ -73,9 +73,9 @@ def run_plan(
                 # Compiling is told apart from mapping.
                 resumed_s += fused.cost.compile_s
             log.add(fused)
+            on_frame(fused)
             if fused.info is not None and fused.prepared.index in plan.key_frames:
                 _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
-            on_frame(fused)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))

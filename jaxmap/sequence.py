@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
@@ -21,7 +20,7 @@ from jaxmap.labellers import Needs
 from jaxmap.mapper import Mapper, MapperParams, StepCost, StepInfo, compile_step
 from jaxmap.prefetch import prefetch
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
-from jaxmap.types import Frame, VoxelMap
+from jaxmap.types import Frame, VoxelMap, to_device
 
 
 @dataclass(frozen=True)
@@ -91,15 +90,15 @@ def prepare_frames(
             filled: dict[str, Any] = {}
             if needs == "image":
                 # All as RGB: a grey image between coloured ones must not change the form of a frame.
-                filled["image"] = jnp.asarray(as_rgb(rectified.left))
+                filled["image"] = to_device(as_rgb(rectified.left))
             if label_folder is not None:
                 started_s = time.perf_counter()
                 filled |= label_folder.read(ref, front_end)
                 stages_s["labels"] = time.perf_counter() - started_s
             if pose_errors is not None:
-                filled["pose_errors"] = jnp.asarray(pose_errors[index], jnp.float32)
-            pose = jaxlie.SE3.from_matrix(jnp.asarray(T_world_camera[index], jnp.float32))
-            frame = Frame(jnp.asarray(rectified.disparity_px), pose, **filled)
+                filled["pose_errors"] = to_device(pose_errors[index], np.float32)
+            pose = jaxlie.SE3.from_matrix(to_device(T_world_camera[index], np.float32))
+            frame = Frame(to_device(rectified.disparity_px), pose, **filled)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)
