@@ -64,7 +64,8 @@ def run_plan(
         pose_errors=plan.pose_errors,
         first=log.next_index,
     )
-    run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict)
+    form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
+    run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form)
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:

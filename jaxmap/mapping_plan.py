@@ -28,9 +28,10 @@ from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.tensor_files import shortened
+from jaxmap.sequence import frame_form
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.rectify import StereoRig
-from jaxmap.types import GridSpec, make_grid
+from jaxmap.types import Frame, GridSpec, make_grid
 
 Tell = Callable[[str], None]
 
@@ -72,6 +73,11 @@ class Plan:
     def members(self) -> int:
         """How many members the ensemble has."""
         return 0 if self.pose_errors is None else self.pose_errors.shape[1]
+
+    @property
+    def frame_form(self) -> Frame:
+        """The form of the frames that the step takes."""
+        return frame_form(self.front_end.camera, self.labeller, self.members)
 
     @property
     def key_frames(self) -> set[int]:

@@ -17,6 +17,7 @@ FLOORS = {
     "jaxmap.labels": 0,
     "jaxmap.files": 0,
     "jaxmap.prefetch": 0,
+    "jaxmap.stages": 0,
     # 1: pure geometry, host stereo, networks
     "jaxmap.geometry": 1,
     "jaxmap.localisation": 1,

@@ -74,7 +74,9 @@ def depth_sigma(
 
 
 @jax.jit
-def depth_at_sigma(camera: StereoCamera, sigma_m: float, disparity_sigma_px: float) -> Float[Array, ""]:
+def depth_at_sigma(
+    camera: StereoCamera, sigma_m: Float[Array, ""] | float, disparity_sigma_px: Float[Array, ""] | float
+) -> Float[Array, ""]:
     """The depth at which depth noise reaches `sigma_m`: the inverse of `depth_sigma`, in metres."""
     return jnp.sqrt(sigma_m * camera.baseline_m * camera.fx_px / disparity_sigma_px)
 
