@@ -37,7 +37,7 @@ def _in_order(
     try:
         while pending:
             wait((pending[0],))
-            # Begun only now that there is a result to be taken; that one gets no name here, to live no longer than needed.
+            # The result that is taken gets no name here: it would live on while the next one is waited for.
             pending.extend(pool.submit(function, item) for item in islice(source, 1))
             yield pending.popleft().result()
     finally:

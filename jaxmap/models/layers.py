@@ -22,8 +22,7 @@ BATCH_NORM_MOMENTUM = 0.9
 """Weight of the old running statistics; torch calls the same 0.1."""
 
 _NO_KEYS: Any = SimpleNamespace(params=lambda: None)
-"""In place of `nnx.Rngs`: norms start with ones and zeros, and to draw keys for them took half of what building a network
-takes."""
+"""In place of `nnx.Rngs`: norms start as ones and zeros, and drawing keys for them took half the time of building."""
 
 
 class ConvBlock(nnx.Module):
