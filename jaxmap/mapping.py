@@ -16,7 +16,8 @@ from jaxmap.map_store import MapAttributes, save_map
 from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json
 from jaxmap.report.html import write_report
-from jaxmap.run_folder import RunFolder, RunLog
+from jaxmap.run_folder import RunFolder
+from jaxmap.run_log import RunLog
 from jaxmap.run_outputs import count_missed, count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.types import VoxelMap
@@ -83,7 +84,7 @@ def run_plan(
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
-        if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == len(log.fused) > 0:
+        if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
             save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
@@ -94,8 +95,8 @@ def run_plan(
     log.complete = True
     attributes = _attributes(plan, log, voxel_map)
     save_map(folder.map, voxel_map, attributes)
-    fused_names = set(log.fused)
-    fused_frames = np.array([frame.name in fused_names for frame in plan.sequence.frames])
+    skipped = {frame["frame"] for frame in log.skipped}
+    fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
@@ -173,7 +174,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "name": sequence.name,
             "dataset": sequence.dataset,
             "frames": len(sequence.frames),
-            "fused": len(log.fused),
+            "fused": log.fused,
             "skipped": log.skipped,
             "crs": sequence.crs,
             "site_origin": sequence.site_origin.tolist(),
@@ -197,11 +198,11 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
         "times": {
             "total_s": round(log.total_s, 3),
             "compile_s": round(log.compile_s, 3),
-            "frames_per_s": round(len(log.fused) / max(log.total_s, 1e-9), 3),
+            "frames_per_s": round(log.fused / max(log.total_s, 1e-9), 3),
             "stages": log.stage_summary(),
         },
         "points": {
-            "valid_fraction": round(float(np.median(log.valid_fractions)), 4),
+            "valid_fraction": round(log.valid_fractions.percentile(50), 4),
             "fused": log.points_fused,
         },
         "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),
