@@ -125,7 +125,8 @@ def make_deeplab_labeller(
 
     def see(frame: Frame, params: Any) -> tuple[Array, Upsampling]:
         image = _image(frame)
-        coarse = network.apply_coarse(params.weights, resized_input(image[None], size_px))[0]
+        with jax.named_scope("network"):
+            coarse = network.apply_coarse(params.weights, resized_input(image[None], size_px))[0]
         return coarse, upsampling(network.architecture, coarse.shape[:2], image.shape[:2], size_px)
 
     def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:

@@ -214,10 +214,11 @@ def make_mapper(
 
 
 class StepCost(NamedTuple):
-    """What the compiler says of a step: time to compile it, and memory it takes beside the map."""
+    """What the compiler says of a step: time to compile it, memory it takes beside the map, and its program as text."""
 
     compile_s: float
     temporary_bytes: int
+    program: Callable[[], str]
 
 
 def compile_step(
@@ -237,7 +238,9 @@ def compile_step(
     def step(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
         return executable(*_apart(voxel_map), frame, params, key)
 
-    return mapper._replace(step=step), StepCost(compile_s, memory.temp_size_in_bytes if memory else 0)
+    return mapper._replace(step=step), StepCost(
+        compile_s, memory.temp_size_in_bytes if memory else 0, executable.as_text
+    )
 
 
 class _Observation(NamedTuple):

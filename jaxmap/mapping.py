@@ -15,6 +15,8 @@ from jaxmap.host_memory import peak_resident_mib
 from jaxmap.map_store import MapAttributes, save_map
 from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json
+from jaxmap.profiling.peaks import measure_peaks
+from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.html import write_report
 from jaxmap.run_folder import RunFolder
 from jaxmap.run_log import RunLog
@@ -31,6 +33,7 @@ def run_plan(
     checkpoint_every_s: float,
     tell: Tell,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
+    profile: bool = False,
 ) -> dict[str, Any]:
     """Maps the sequence and writes all outputs.
 
@@ -44,6 +47,7 @@ def run_plan(
         checkpoint_every_s: how often the map is saved on the way.
         tell: takes lines for the user.
         on_frame: called after each frame.
+        profile: record a trace of some steps into the folder, and tell where their time went.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -56,6 +60,7 @@ def run_plan(
         tell("the run is complete already; its outputs are written anew")
     elif log.next_index:
         tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
+    step_profile, program = StepProfile(folder.profile) if profile else None, None
     saved_s = resumed_s = time.perf_counter()
     frames = prepare_frames(
         plan.sequence,
@@ -70,11 +75,14 @@ def run_plan(
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
+                program = fused.cost.program
                 log.temporary_bytes = fused.cost.temporary_bytes
                 log.compile_s += fused.cost.compile_s
                 # Compiling is told apart from mapping.
                 resumed_s += fused.cost.compile_s
             log.add(fused)
+            if step_profile is not None and fused.info is not None:
+                step_profile.step_done()
             on_frame(fused)
             if fused.info is not None and fused.prepared.index in plan.key_frames:
                 _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
@@ -88,6 +96,9 @@ def run_plan(
             save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
+    finally:
+        if step_profile is not None:
+            step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
@@ -103,11 +114,24 @@ def run_plan(
     )
     write_exports(folder, voxel_map, attributes)
     metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map)
+    if step_profile is not None:
+        metrics |= _profile(step_profile, program, tell)
     write_json(folder.metrics, metrics)
     write_report(folder.path)
     if not metrics["voxels"]["occupied"]:
         tell("note: no voxel is occupied: check the bounds, the range and the poses")
     return metrics
+
+
+def _profile(step_profile: StepProfile, program: Callable[[], str] | None, tell: Tell) -> dict[str, Any]:
+    """What metrics.json holds of the steps that were traced."""
+    if program is None or step_profile.steps <= WARM_UP_FRAMES:
+        tell(f"note: {step_profile.steps} frames are too few for a profile: it takes more than {WARM_UP_FRAMES}")
+        return {}
+    summary = step_profile.summary(program, measure_peaks())
+    for line in table_lines(summary):
+        tell(line)
+    return {"profile": summary}
 
 
 def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:

@@ -35,6 +35,7 @@ class RunFolder:
         self.scores = path / "scores.json"
         self.errors = path / "errors.png"
         self.pictures = path / "pictures"
+        self.profile = path / "profile"
 
     def locked(self) -> AbstractContextManager[None]:
         """Keeps other runs out of the folder, see `output_folder.locked`."""
@@ -117,7 +118,8 @@ class RunFolder:
                     fix="choose another --out",
                 )
             return
-        shutil.rmtree(self.map, ignore_errors=True)
+        for folder in (self.map, self.profile):
+            shutil.rmtree(folder, ignore_errors=True)
         for file in self._files:
             file.unlink(missing_ok=True)
         for picture in self.pictures.glob("*.png"):

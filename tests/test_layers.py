@@ -50,6 +50,7 @@ FLOORS = {
     "jaxmap.config": 6,
     "jaxmap.cache": 6,
     "jaxmap.host_memory": 6,
+    "jaxmap.profiling": 6,
     # 7: runs
     "jaxmap.output_folder": 7,
     "jaxmap.training_folder": 7,

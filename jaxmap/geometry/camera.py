@@ -83,10 +83,11 @@ def depth_at_sigma(
 
 def transform_points(T_a_b: jaxlie.SE3, points_b: Float[Array, "*s 3"]) -> Float[Array, "*s 3"]:
     """Points of frame b in frame a."""
-    R, t = T_a_b.rotation().as_matrix(), T_a_b.translation()
-    x, y, z = points_b[..., 0], points_b[..., 1], points_b[..., 2]
-    # Written out: as a dot with a 3x3 matrix it is three times slower on CPU.
-    return jnp.stack([R[i, 0] * x + R[i, 1] * y + R[i, 2] * z + t[i] for i in range(3)], axis=-1)
+    with jax.named_scope("transform"):
+        R, t = T_a_b.rotation().as_matrix(), T_a_b.translation()
+        x, y, z = points_b[..., 0], points_b[..., 1], points_b[..., 2]
+        # Written out: as a dot with a 3x3 matrix it is three times slower on CPU.
+        return jnp.stack([R[i, 0] * x + R[i, 1] * y + R[i, 2] * z + t[i] for i in range(3)], axis=-1)
 
 
 @jax.jit
