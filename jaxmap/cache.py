@@ -17,7 +17,7 @@ def keep_compiled_programs(*, scopes: bool = False) -> None:
     """Lets JAX keep what it compiles, so that a second run of the same kind starts at once.
 
     Args:
-        scopes: take a kept program only where the names of its stages are those of today's code, too, as a profile needs
+        scopes: take a kept program only where the names of its stages are those of this code, too, as a profile needs
             them; otherwise names do not matter.
     """
     import jax

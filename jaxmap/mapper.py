@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,9 @@ from jaxmap.geometry.grid import window_shape
 from jaxmap.labellers import Labeller, harden
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, GridSpec, Plane, PointLabels, StereoCamera, VoxelMap, make_voxel_map
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 _ENSEMBLE_DRAW = 1
 """Folded into a frame's key for the draws of the ensemble; the labeller draws from the key itself."""
@@ -119,6 +123,7 @@ def make_mapper(
     def init() -> VoxelMap:
         return make_voxel_map(grid, labeller.classes, members)
 
+    @_exactly
     def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
         """The labelled points of a frame; `key` is the frame's own."""
         if labeller.needs is not None and getattr(frame, labeller.needs) is None:
@@ -140,6 +145,7 @@ def make_mapper(
         labels, plane = labeller.label(frame, points_world, in_range.reshape(-1), params.labeller, key)
         return _Observation(depth_m, valid, in_range, points_world, labels, plane)
 
+    @_exactly
     def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
         frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
         seen = observe(frame, params, frame_key)
@@ -218,7 +224,7 @@ class StepCost(NamedTuple):
 
     compile_s: float
     temporary_bytes: int
-    program: Callable[[], str]
+    program: Callable[[], str | None]
 
 
 def compile_step(
@@ -241,6 +247,20 @@ def compile_step(
     return mapper._replace(step=step), StepCost(
         compile_s, memory.temp_size_in_bytes if memory else 0, executable.as_text
     )
+
+
+def _exactly(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """The same with products of matrices in full float32: a GPU by itself rounds the factors to ten bits.
+
+    Positions of many metres would be off by centimetres. A CPU computes them in full whatever it is told.
+    """
+
+    @functools.wraps(function)
+    def exact(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
+        with jax.default_matmul_precision(None if jax.default_backend() == "cpu" else "highest"):
+            return function(*arguments, **options)
+
+    return exact
 
 
 class _Observation(NamedTuple):

@@ -15,7 +15,6 @@ from jaxmap.host_memory import peak_resident_mib
 from jaxmap.map_store import MapAttributes, save_map
 from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json
-from jaxmap.profiling.peaks import measure_peaks
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.html import write_report
 from jaxmap.run_folder import RunFolder
@@ -60,7 +59,7 @@ def run_plan(
         tell("the run is complete already; its outputs are written anew")
     elif log.next_index:
         tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
-    step_profile, program = StepProfile(folder.profile) if profile else None, None
+    step_profile, program = StepProfile(folder.profile if profile else None), None
     saved_s = resumed_s = time.perf_counter()
     frames = prepare_frames(
         plan.sequence,
@@ -81,7 +80,7 @@ def run_plan(
                 # Compiling is told apart from mapping.
                 resumed_s += fused.cost.compile_s
             log.add(fused)
-            if step_profile is not None and fused.info is not None:
+            if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
             if fused.info is not None and fused.prepared.index in plan.key_frames:
@@ -97,13 +96,23 @@ def run_plan(
             tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
-        if step_profile is not None:
-            step_profile.close()
+        step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
+    details = _profile(step_profile, program, tell) if profile else {}
+    metrics = _write_outputs(plan, folder, log, voxel_map, details)
+    if not metrics["voxels"]["occupied"]:
+        tell("note: no voxel is occupied: check the bounds, the range and the poses")
+    return metrics
+
+
+def _write_outputs(
+    plan: Plan, folder: RunFolder, log: RunLog, voxel_map: VoxelMap, details: dict[str, Any]
+) -> dict[str, Any]:
+    """Writes all that a run leaves, and returns its metrics, the details among them."""
     attributes = _attributes(plan, log, voxel_map)
     save_map(folder.map, voxel_map, attributes)
     skipped = {frame["frame"] for frame in log.skipped}
@@ -113,22 +122,18 @@ def run_plan(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
     write_exports(folder, voxel_map, attributes)
-    metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map)
-    if step_profile is not None:
-        metrics |= _profile(step_profile, program, tell)
+    metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map) | details
     write_json(folder.metrics, metrics)
     write_report(folder.path)
-    if not metrics["voxels"]["occupied"]:
-        tell("note: no voxel is occupied: check the bounds, the range and the poses")
     return metrics
 
 
-def _profile(step_profile: StepProfile, program: Callable[[], str] | None, tell: Tell) -> dict[str, Any]:
+def _profile(step_profile: StepProfile, program: Callable[[], str | None] | None, tell: Tell) -> dict[str, Any]:
     """What metrics.json holds of the steps that were traced."""
-    if program is None or step_profile.steps <= WARM_UP_FRAMES:
+    summary = step_profile.summary(program)
+    if summary is None:
         tell(f"note: {step_profile.steps} frames are too few for a profile: it takes more than {WARM_UP_FRAMES}")
         return {}
-    summary = step_profile.summary(program, measure_peaks())
     for line in table_lines(summary):
         tell(line)
     return {"profile": summary}

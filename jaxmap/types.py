@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import numpy.typing as npt
 from jax.typing import DTypeLike
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxmap.errors import JaxmapError
 
@@ -28,7 +29,7 @@ def _static() -> dict[str, bool]:
     return {"static": True}
 
 
-def to_device(value: ArrayLike, dtype: DTypeLike | None = None) -> Array:
+def to_device(value: npt.ArrayLike, dtype: DTypeLike | None = None) -> Array:
     """Numbers of the host as an array of JAX's.
 
     `jnp.asarray` comes to the same, but compiles a program for each new shape; this compiles nothing. Not to be called

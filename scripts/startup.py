@@ -1,6 +1,6 @@
 """How long jaxmap takes to start: its help, and the first mapped frame, with an empty cache and with a full one.
 
-    python scripts/startup.py [--sequence SEQUENCE] [--config NAME] [--labellers none plane deeplab] [--repeats 5] [--json F]
+    python scripts/startup.py [--sequence SEQUENCE] [--config NAME] [--labellers none plane deeplab] [--repeats 5]
 
 Every figure is that of a process of its own, from its creation on, as wall time and as processor time: where others use
 the same cores the wall time grows, the other less so. Threads that read ahead count, too, as two frames and more are

@@ -23,7 +23,6 @@ from jaxmap.config import load_config
 from jaxmap.host_memory import restart_with_lasting_memory
 from jaxmap.mapper import compile_step
 from jaxmap.mapping_plan import plan_run
-from jaxmap.profiling.peaks import measure_peaks
 from jaxmap.profiling.step_profile import TRACED_FRAMES, WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.sequence import prepare_frames
 
@@ -46,7 +45,6 @@ def main() -> None:
     frames = [one.frame for one in prepared if one.frame is not None]
     voxel_map = plan.mapper.init()
     mapper, cost = compile_step(plan.mapper, voxel_map, frames[0], plan.params, plan.key)
-    peaks = measure_peaks()
     with tempfile.TemporaryDirectory() as folder:
         profile, times_s = StepProfile(Path(folder)), []
         for frame in islice(cycle(frames), WARM_UP_FRAMES + TRACED_FRAMES):
@@ -55,8 +53,9 @@ def main() -> None:
             jax.block_until_ready(voxel_map.log_odds)
             times_s.append(time.perf_counter() - started_s)
             profile.step_done()
-        summary = profile.summary(cost.program, peaks)
+        summary = profile.summary(cost.program)
     step_ms = 1e3 * sorted(times_s[WARM_UP_FRAMES:])[TRACED_FRAMES // 2]
+    assert summary is not None
     print("\n".join([f"labeller {given.labeller}: a step takes {step_ms:.1f} ms, traced", *table_lines(summary)]))
     if given.json:
         given.json.write_text(json.dumps({**summary, "step_ms": round(step_ms, 3)}, indent=2) + "\n")

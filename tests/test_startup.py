@@ -29,7 +29,14 @@ import jax
 from jaxmap.cli import main
 
 misses = []
-jax.monitoring.register_event_listener(lambda event, **_: misses.append(event) if event.endswith("cache_misses") else None)
+
+
+def hear(event, **_):
+    if event.endswith("cache_misses"):
+        misses.append(event)
+
+
+jax.monitoring.register_event_listener(hear)
 status = main(sys.argv[1:])
 print(json.dumps({"status": status, "misses": len(misses)}))
 """

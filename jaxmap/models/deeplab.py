@@ -205,8 +205,8 @@ def weight_shapes(architecture: Architecture) -> Mapping[str, tuple[int, ...]]:
 
 def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
     """The pure form of a network with given weights, which must be complete."""
-    on_host = [name for name, value in weights.items() if not isinstance(value, jax.Array)]
-    return _pure_form(architecture, {**weights, **{name: to_device(weights[name]) for name in on_host}})
+    arrays = {name: value if isinstance(value, Array) else to_device(value) for name, value in weights.items()}
+    return _pure_form(architecture, arrays)
 
 
 def fold_batch_norm(

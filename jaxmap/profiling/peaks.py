@@ -23,7 +23,7 @@ class Peaks(NamedTuple):
 
 
 def measure_peaks() -> Peaks:
-    """Changes 128 MiB in place, which no cache holds, and multiplies matrices of 2048 x 2048: the median of seven each."""
+    """Changes 128 MiB in place, more than caches hold; multiplies matrices of 2048 x 2048: each the median of seven."""
     # In place, as fresh memory has to be fetched from the system first, which takes longer than to fill it.
     negate = jax.jit(jnp.negative, donate_argnums=0)
     values, matrix = jnp.ones(_COPIED, jnp.float32), jnp.ones((_EDGE, _EDGE), jnp.float32)

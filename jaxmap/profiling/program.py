@@ -1,7 +1,7 @@
 """What each operation of a compiled program belongs to, computes and moves, read from the program's text.
 
-XLA keeps the `jax.named_scope` that an operation comes from as its `op_name`, through fusion and scheduling; traces name
-operations but not their scopes. The text has both.
+XLA keeps the `jax.named_scope` that an operation comes from as its `op_name`, through fusion and scheduling; traces
+name operations but not their scopes. The text has both.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 STAGES = (

@@ -12,7 +12,7 @@ import jax
 
 from jaxmap.errors import JaxmapError
 from jaxmap.files import write_error
-from jaxmap.profiling.peaks import Peaks
+from jaxmap.profiling.peaks import Peaks, measure_peaks
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program
 from jaxmap.profiling.trace import OperationTimes, read_operation_times
 
@@ -31,15 +31,15 @@ class StepProfile:
         steps: how many were made; those after the first `WARM_UP_FRAMES` are traced.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Nothing is recorded yet; the trace goes into `folder`, for TensorBoard (XProf) or Perfetto."""
+    def __init__(self, folder: Path | None) -> None:
+        """Nothing is recorded yet; the trace goes into `folder`, for TensorBoard (XProf) or Perfetto; None: none is."""
         self._folder = folder
         self.steps, self._recording = 0, False
 
     def step_done(self) -> None:
         """One more step was made: the trace may begin or end here."""
         self.steps += 1
-        if self.steps == WARM_UP_FRAMES:
+        if self.steps == WARM_UP_FRAMES and self._folder is not None:
             self._start()
         elif self.steps == WARM_UP_FRAMES + TRACED_FRAMES:
             self.close()
@@ -55,20 +55,22 @@ class StepProfile:
             try:
                 jax.profiler.stop_trace()
             except OSError as error:
-                raise write_error(error, self._folder) from error
+                raise write_error(error, Path(str(self._folder))) from error
 
-    def summary(self, program: Callable[[], str], peaks: Peaks) -> dict[str, Any]:
-        """Where the time of the steps went (`stage_table`), and what the machine reaches.
+    def summary(self, program: Callable[[], str | None] | None) -> dict[str, Any] | None:
+        """Where the time of the steps went (`stage_table`), and what the machine reaches; None if nothing was traced.
 
         Args:
-            program: gives the text of the step's program.
-            peaks: of this machine.
+            program: gives the text of the step's program, where the backend has one; None where no step was compiled.
 
         Raises:
-            JaxmapError: nothing was traced (`WARM_UP_FRAMES` or fewer), or it cannot be read.
+            JaxmapError: the trace cannot be read.
         """
         self.close()
-        text = program()
+        text = program() if program is not None else None
+        if self._folder is None or text is None or self.steps <= WARM_UP_FRAMES:
+            return None
+        peaks = measure_peaks()
         runs = read_operation_times(self._folder, _module_name(text))
         return {
             "frames": len(runs),
@@ -148,7 +150,7 @@ def _module_name(text: str) -> str:
 def table_lines(summary: Mapping[str, Any]) -> list[str]:
     """The table as text."""
     lines = [
-        f"{'stage':15s}{'ms':>9s}{'share':>8s}{'ops':>6s}{'MB':>9s}{'MFLOP':>10s}{'GB/s':>8s}{'GFLOP/s':>9s}  nearest bound"
+        f"{'stage':15s}{'ms':>9s}{'share':>8s}{'ops':>6s}{'MB':>9s}{'MFLOP':>10s}{'GB/s':>8s}{'GFLOP/s':>9s}  bound by"
     ]
     for stage, row in summary["stages"].items():
         lines.append(
