@@ -17,7 +17,7 @@ from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import Weights, fold_batch_norm, pure_network
 from jaxmap.models.pixelwise import Size, Upsampling, check_size, map_pixels, resized_input, upsampling
 from jaxmap.models.tensor_files import shortened
-from jaxmap.types import Frame, PointLabels
+from jaxmap.types import Frame, PointLabels, to_device
 
 _WHERE = "deeplab labeller"
 
@@ -117,7 +117,7 @@ def make_deeplab_labeller(
     if not 0 < temperature < float("inf"):
         raise JaxmapError(f"temperature {temperature}", where=_WHERE, fix="give a number above 0")
     mapped = make_class_map(saved.architecture.classes, classes, class_map)
-    network = pure_network(*fold_batch_norm(saved.architecture, saved.weights))
+    network = pure_network(*fold_batch_norm(saved.architecture, jax.tree.map(np.asarray, saved.weights)))
     groups = [
         [index for index, target in enumerate(mapped.targets) if target == wanted]
         for wanted in range(len(mapped.classes))
@@ -125,7 +125,8 @@ def make_deeplab_labeller(
 
     def see(frame: Frame, params: Any) -> tuple[Array, Upsampling]:
         image = _image(frame)
-        coarse = network.apply_coarse(params.weights, resized_input(image[None], size_px))[0]
+        with jax.named_scope("network"):
+            coarse = network.apply_coarse(params.weights, resized_input(image[None], size_px))[0]
         return coarse, upsampling(network.architecture, coarse.shape[:2], image.shape[:2], size_px)
 
     def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:
@@ -149,7 +150,7 @@ def make_deeplab_labeller(
         every = jax.nn.softmax(values / numbers["temperature"], axis=-1)
         return jnp.stack([every[:, jnp.array(group)].sum(axis=-1) for group in groups], axis=-1)
 
-    params = DeeplabParams(network.weights, jnp.asarray(np.log(temperature), jnp.float32))
+    params = DeeplabParams(network.weights, to_device(np.log(temperature), np.float32))
     soft_labels = TunableLabels({"temperature": temperature}, {"temperature": (0.02, 50.0)}, cues, probabilities)
     tunable = soft_labels if soft else fixed_labels(label)
     return Labeller("deeplab", mapped.classes, "image", label, params, tunable)

@@ -8,12 +8,13 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.plane import fit_plane_mlesac, plane_distance, refit_plane, search_plane
 from jaxmap.labels import IGNORE
-from jaxmap.types import Frame, Plane, PointLabels
+from jaxmap.types import Frame, Plane, PointLabels, to_device
 
 UP_WORLD = (0.0, 0.0, 1.0)
 
@@ -138,7 +139,7 @@ def make_plane_labeller(
     if unknown:
         raise JaxmapError(f"fit_plane_mlesac has no option {', '.join(sorted(unknown))}", where="plane labeller")
     sand, rock = classes.index(on_plane), classes.index(off_plane)
-    up = {"up_hint": jnp.array(UP_WORLD)}
+    up = {"up_hint": to_device(UP_WORLD, np.float32)}
 
     def shares(off_m: Array, found: Array, threshold_m: Array, softness_m: Array) -> Array:
         off = jax.nn.sigmoid((off_m - threshold_m) / softness_m)
@@ -178,7 +179,7 @@ def make_plane_labeller(
         return shares(off, planes.found[frame], numbers["threshold_m"], numbers["softness_m"])
 
     numbers = {"sigma_m": sigma_m, "threshold_m": threshold_m, "softness_m": softness_m}
-    params = PlaneParams(**{name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()})
+    params = PlaneParams(**{name: to_device(value, np.float32) for name, value in numbers.items()})
     limits = {"sigma_m": (1e-3, 1.0), "threshold_m": (5e-3, 0.99 * max_height_m), "softness_m": (1e-3, 1.0)}
     return Labeller("plane", tuple(classes), None, label, params, TunableLabels(numbers, limits, cues, probabilities))
 

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from jaxmap.errors import JaxmapError
 from jaxmap.files import sync, write_error
 from jaxmap.map_arrays import StoredArray, read_array, write_array
-from jaxmap.types import GridSpec, VoxelMap
+from jaxmap.types import GridSpec, VoxelMap, to_device
 
 if TYPE_CHECKING:
     import zarr
@@ -117,7 +117,7 @@ def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[Vo
         _check_finite(ensemble, target)
     voxel_map = VoxelMap(
         log_odds=jnp.asarray(log_odds),
-        frames_fused=jnp.asarray(frames_fused, jnp.int32),
+        frames_fused=to_device(frames_fused, np.int32),
         grid=grid,
         classes=classes,
         members=None if ensemble is None else jnp.asarray(ensemble),
@@ -250,8 +250,8 @@ def _from_json(stored: dict[str, Any], where: Path) -> tuple[GridSpec, tuple[str
         if (size_m <= 0).any() or (shape < 1).any() or (shape % 1).any():
             raise _bad_attribute("voxel_size_m or shape", [size_m.tolist(), shape.tolist()], where)
         grid = GridSpec(
-            origin_m=jnp.asarray(_numbers(stored, "origin_m", (3,), where), jnp.float32),
-            voxel_size_m=jnp.asarray(size_m, jnp.float32),
+            origin_m=to_device(_numbers(stored, "origin_m", (3,), where), np.float32),
+            voxel_size_m=to_device(size_m, np.float32),
             shape=(int(shape[0]), int(shape[1]), int(shape[2])),
         )
         crs, fusion, progress = stored["crs"], stored["fusion"], stored.get("progress", {"complete": True})

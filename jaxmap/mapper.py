@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +23,7 @@ from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import window_shape
 from jaxmap.labellers import Labeller, harden
 from jaxmap.labels import IGNORE
+from jaxmap.precision import in_full_float32
 from jaxmap.types import Frame, GridSpec, Plane, PointLabels, StereoCamera, VoxelMap, make_voxel_map
 
 _ENSEMBLE_DRAW = 1
@@ -120,7 +121,7 @@ def make_mapper(
         )
     reach = Reach(depth_range_m, window_shape(grid, camera, max_depth_m, T_world_camera))
     design = _Design(labeller, rule, reach, members)
-    fuse = partial(_fuse, design)
+    fuse = functools.partial(_fuse, design)
 
     def scan(voxel_map: VoxelMap, frames: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
         return jax.lax.scan(lambda carried, frame: fuse(carried, frame, params, key), voxel_map, frames)
@@ -142,17 +143,18 @@ def make_mapper(
         step=step,
         fuse=fuse,
         scan=jax.jit(scan),
-        label_image=jax.jit(partial(_label_image, design)),
+        label_image=jax.jit(functools.partial(_label_image, design)),
         lower=lower,
         compilations=compiled._cache_size,
     )
 
 
 class StepCost(NamedTuple):
-    """What the compiler says of a step: time to compile it, and memory it takes beside the map."""
+    """What the compiler says of a step: time to compile it, memory it takes beside the map, and its program as text."""
 
     compile_s: float
     temporary_bytes: int
+    program: Callable[[], str | None]
 
 
 def compile_step(
@@ -172,7 +174,9 @@ def compile_step(
     def step(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
         return executable(*_apart(voxel_map), frame, params, key)
 
-    return mapper._replace(step=step), StepCost(compile_s, memory.temp_size_in_bytes if memory else 0)
+    return mapper._replace(step=step), StepCost(
+        compile_s, memory.temp_size_in_bytes if memory else 0, executable.as_text
+    )
 
 
 class _Design(NamedTuple):
@@ -195,6 +199,7 @@ class _Observation(NamedTuple):
     plane: Plane | None
 
 
+@in_full_float32
 def _observe(design: _Design, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
     """The labelled points of a frame; `key` is the frame's own."""
     labeller = design.labeller
@@ -219,6 +224,7 @@ def _observe(design: _Design, frame: Frame, params: MapperParams, key: PRNGKeyAr
     return _Observation(depth_m, valid, in_range, points_world, labels, plane)
 
 
+@in_full_float32
 def _fuse(
     design: _Design, voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray
 ) -> tuple[VoxelMap, StepInfo]:

@@ -15,8 +15,10 @@ from jaxmap.host_memory import peak_resident_mib
 from jaxmap.map_store import MapAttributes, save_map
 from jaxmap.mapping_plan import Plan, Tell
 from jaxmap.output_folder import write_json
+from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.html import write_report
-from jaxmap.run_folder import RunFolder, RunLog
+from jaxmap.run_folder import RunFolder
+from jaxmap.run_log import RunLog
 from jaxmap.run_outputs import count_missed, count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.types import VoxelMap
@@ -30,6 +32,7 @@ def run_plan(
     checkpoint_every_s: float,
     tell: Tell,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
+    profile: bool = False,
 ) -> dict[str, Any]:
     """Maps the sequence and writes all outputs.
 
@@ -43,6 +46,7 @@ def run_plan(
         checkpoint_every_s: how often the map is saved on the way.
         tell: takes lines for the user.
         on_frame: called after each frame.
+        profile: record a trace of some steps into the folder, and tell where their time went.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -55,6 +59,7 @@ def run_plan(
         tell("the run is complete already; its outputs are written anew")
     elif log.next_index:
         tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
+    step_profile, program = StepProfile(folder.profile if profile else None), None
     saved_s = resumed_s = time.perf_counter()
     frames = prepare_frames(
         plan.sequence,
@@ -64,48 +69,74 @@ def run_plan(
         pose_errors=plan.pose_errors,
         first=log.next_index,
     )
-    run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict)
+    form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
+    run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form)
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
+                program = fused.cost.program
                 log.temporary_bytes = fused.cost.temporary_bytes
                 log.compile_s += fused.cost.compile_s
                 # Compiling is told apart from mapping.
                 resumed_s += fused.cost.compile_s
             log.add(fused)
+            if fused.info is not None:
+                step_profile.step_done()
+            on_frame(fused)
             if fused.info is not None and fused.prepared.index in plan.key_frames:
                 _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
-            on_frame(fused)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
-        if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == len(log.fused) > 0:
+        if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
             save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
+    finally:
+        step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
+    details = _profile(step_profile, program, tell) if profile else {}
+    metrics = _write_outputs(plan, folder, log, voxel_map, details)
+    if not metrics["voxels"]["occupied"]:
+        tell("note: no voxel is occupied: check the bounds, the range and the poses")
+    return metrics
+
+
+def _write_outputs(
+    plan: Plan, folder: RunFolder, log: RunLog, voxel_map: VoxelMap, details: dict[str, Any]
+) -> dict[str, Any]:
+    """Writes all that a run leaves, and returns its metrics, the details among them."""
     attributes = _attributes(plan, log, voxel_map)
     save_map(folder.map, voxel_map, attributes)
-    fused_names = set(log.fused)
-    fused_frames = np.array([frame.name in fused_names for frame in plan.sequence.frames])
+    skipped = {frame["frame"] for frame in log.skipped}
+    fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
     write_exports(folder, voxel_map, attributes)
-    metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map)
+    metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map) | details
     write_json(folder.metrics, metrics)
     write_report(folder.path)
-    if not metrics["voxels"]["occupied"]:
-        tell("note: no voxel is occupied: check the bounds, the range and the poses")
     return metrics
+
+
+def _profile(step_profile: StepProfile, program: Callable[[], str | None] | None, tell: Tell) -> dict[str, Any]:
+    """What metrics.json holds of the steps that were traced."""
+    summary = step_profile.summary(program)
+    if summary is None:
+        tell(f"note: {step_profile.steps} frames are too few for a profile: it takes more than {WARM_UP_FRAMES}")
+        return {}
+    for line in table_lines(summary):
+        tell(line)
+    return {"profile": summary}
 
 
 def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
@@ -172,7 +203,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "name": sequence.name,
             "dataset": sequence.dataset,
             "frames": len(sequence.frames),
-            "fused": len(log.fused),
+            "fused": log.fused,
             "skipped": log.skipped,
             "crs": sequence.crs,
             "site_origin": sequence.site_origin.tolist(),
@@ -196,11 +227,11 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
         "times": {
             "total_s": round(log.total_s, 3),
             "compile_s": round(log.compile_s, 3),
-            "frames_per_s": round(len(log.fused) / max(log.total_s, 1e-9), 3),
+            "frames_per_s": round(log.fused / max(log.total_s, 1e-9), 3),
             "stages": log.stage_summary(),
         },
         "points": {
-            "valid_fraction": round(float(np.median(log.valid_fractions)), 4),
+            "valid_fraction": round(log.valid_fractions.percentile(50), 4),
             "fused": log.points_fused,
         },
         "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),

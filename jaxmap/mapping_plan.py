@@ -25,8 +25,9 @@ from jaxmap.labellers import Labeller
 from jaxmap.mapper import Mapper, MapperParams, make_mapper
 from jaxmap.mapping_grid import choose_grid, told_grid
 from jaxmap.mapping_labels import ModelFile, choose_label_folder, choose_labeller, choose_model, told_network
+from jaxmap.sequence import frame_form
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.types import GridSpec
+from jaxmap.types import Frame, GridSpec
 
 Tell = Callable[[str], None]
 
@@ -57,6 +58,11 @@ class Plan:
     def members(self) -> int:
         """How many members the ensemble has."""
         return 0 if self.pose_errors is None else self.pose_errors.shape[1]
+
+    @property
+    def frame_form(self) -> Frame:
+        """The form of the frames that the step takes."""
+        return frame_form(self.front_end.camera, self.labeller, self.members)
 
     @property
     def key_frames(self) -> set[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,17 +10,19 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxmap.datasets.base import FrameRef, StereoSequence
 from jaxmap.datasets.images import as_rgb
 from jaxmap.datasets.label_files import LabelFolder
 from jaxmap.errors import FrameError
-from jaxmap.labellers import Needs
+from jaxmap.labellers import Labeller, Needs
 from jaxmap.mapper import Mapper, MapperParams, StepCost, StepInfo, compile_step
 from jaxmap.prefetch import prefetch
+from jaxmap.stages import timed_stage
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
-from jaxmap.types import Frame, VoxelMap
+from jaxmap.types import Frame, StereoCamera, VoxelMap, to_device
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def prepare_frames(
     workers: int = 2,
     ahead: int = 4,
 ) -> Iterator[PreparedFrame]:
-    """Reads, rectifies and matches the frames of a sequence ahead of their use.
+    """Reads, rectifies and matches the frames of a sequence ahead of their use; the first are begun at once.
 
     Args:
         sequence: the frames and their poses.
@@ -83,33 +84,60 @@ def prepare_frames(
     def prepare(index: int) -> PreparedFrame:
         ref = sequence.frames[index]
         try:
-            started_s = time.perf_counter()
-            pair = sequence.read_pair(ref)
-            stages_s = {"read": time.perf_counter() - started_s}
+            stages_s: dict[str, float] = {}
+            with timed_stage("read", stages_s):
+                pair = sequence.read_pair(ref)
             rectified = front_end(pair.left, pair.right)
             stages_s |= {"rectify": rectified.rectify_s, "match": rectified.match_s}
             filled: dict[str, Any] = {}
             if needs == "image":
                 # All as RGB: a grey image between coloured ones must not change the form of a frame.
-                filled["image"] = jnp.asarray(as_rgb(rectified.left))
+                filled["image"] = to_device(as_rgb(rectified.left))
             if label_folder is not None:
-                started_s = time.perf_counter()
-                filled |= label_folder.read(ref, front_end)
-                stages_s["labels"] = time.perf_counter() - started_s
+                with timed_stage("labels", stages_s):
+                    filled |= label_folder.read(ref, front_end)
             if pose_errors is not None:
-                filled["pose_errors"] = jnp.asarray(pose_errors[index], jnp.float32)
-            pose = jaxlie.SE3.from_matrix(jnp.asarray(T_world_camera[index], jnp.float32))
-            frame = Frame(jnp.asarray(rectified.disparity_px), pose, **filled)
+                filled["pose_errors"] = to_device(pose_errors[index], np.float32)
+            pose = jaxlie.SE3.from_matrix(to_device(T_world_camera[index], np.float32))
+            frame = Frame(to_device(rectified.disparity_px), pose, **filled)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)
 
+    return _in_right_order(prefetch(prepare, range(first, len(sequence.frames)), workers, ahead), front_end)
+
+
+def _in_right_order(frames: Iterator[PreparedFrame], front_end: StereoFrontEnd) -> Iterator[PreparedFrame]:
+    """The same frames, the first readable one checked for swapped images."""
     order_checked = False
-    for prepared in prefetch(prepare, range(first, len(sequence.frames)), workers, ahead):
+    for prepared in frames:
         if prepared.rectified is not None and not order_checked:
             front_end.check_order(prepared.rectified, f"frame {prepared.ref.name}")
             order_checked = True
         yield prepared
+
+
+def frame_form(camera: StereoCamera, labeller: Labeller, members: int = 0) -> Frame:
+    """The form of the frames that `prepare_frames` makes for a labeller: shapes without numbers.
+
+    Args:
+        camera: the rectified camera.
+        labeller: what asks for images, labels or probabilities.
+        members: of an ensemble.
+    """
+    size = (camera.height_px, camera.width_px)
+    kinds: dict[Needs, tuple[tuple[int, ...], DTypeLike]] = {
+        "image": ((*size, 3), np.uint8),
+        "labels": (size, np.uint8),
+        "class_probabilities": ((*size, len(labeller.classes)), np.float32),
+    }
+
+    def frame() -> Frame:
+        filled: dict[str, Any] = {} if labeller.needs is None else {labeller.needs: jnp.zeros(*kinds[labeller.needs])}
+        pose_errors = jnp.zeros((members, 6), np.float32) if members else None
+        return Frame(jnp.zeros(size, np.float32), jaxlie.SE3.identity(), pose_errors=pose_errors, **filled)
+
+    return jax.eval_shape(frame)
 
 
 def run_sequence(
@@ -120,8 +148,19 @@ def run_sequence(
     key: PRNGKeyArray,
     *,
     strict: bool = False,
+    form: Frame | None = None,
 ) -> Iterator[tuple[VoxelMap, FusedFrame]]:
-    """Fuses prepared frames one after the other; the first one that is ready compiles the step.
+    """Fuses prepared frames one after the other.
+
+    Args:
+        mapper: its step.
+        voxel_map: where to begin.
+        frames: of `prepare_frames`.
+        params: the numbers of the step.
+        key: that of the run.
+        strict: stop at a frame that cannot be used.
+        form: that of the frames (`frame_form`): the step is compiled for it while the first ones are read. Without it,
+            the first frame that is ready compiles the step.
 
     Yields:
         After each frame, the map so far and what became of the frame. The map is donated to the
@@ -130,19 +169,34 @@ def run_sequence(
     Raises:
         FrameError: a frame cannot be used and `strict` is set; otherwise it is skipped.
     """
-    cost: StepCost | None = None
-    for prepared in frames:
+    cost = news = None
+    if form is not None:
+        mapper, cost = compile_step(mapper, voxel_map, form, params, key)
+        news = cost
+    for prepared in _timed(frames):
         if prepared.frame is None:
             if strict and prepared.fault is not None:
                 raise prepared.fault
             yield voxel_map, FusedFrame(prepared)
             continue
-        news = None
         if cost is None:
             mapper, cost = compile_step(mapper, voxel_map, prepared.frame, params, key)
             news = cost
-        started_s = time.perf_counter()
-        voxel_map, info = mapper.step(voxel_map, prepared.frame, params, key)
-        jax.block_until_ready(voxel_map.log_odds)
-        prepared.stages_s["step"] = time.perf_counter() - started_s
+        with timed_stage("step", prepared.stages_s):
+            voxel_map, info = mapper.step(voxel_map, prepared.frame, params, key)
+            jax.block_until_ready(voxel_map.log_odds)
         yield voxel_map, FusedFrame(prepared, info, news)
+        news = None
+
+
+def _timed(frames: Iterable[PreparedFrame]) -> Iterator[PreparedFrame]:
+    """The same frames; how long each was waited for is one of its stages."""
+    source = iter(frames)
+    while True:
+        waited_s: dict[str, float] = {}
+        with timed_stage("wait", waited_s):
+            prepared = next(source, None)
+        if prepared is None:
+            return
+        prepared.stages_s.update(waited_s)
+        yield prepared

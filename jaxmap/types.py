@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import numpy.typing as npt
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxmap.errors import JaxmapError
@@ -25,6 +27,15 @@ MAX_TENSOR_ELEMENTS = 2**31 - 1
 
 def _static() -> dict[str, bool]:
     return {"static": True}
+
+
+def to_device(value: npt.ArrayLike, dtype: DTypeLike | None = None) -> Array:
+    """Numbers of the host as an array of JAX's.
+
+    `jnp.asarray` comes to the same, but compiles a program for each new shape; this compiles nothing. Not to be called
+    within a traced function.
+    """
+    return jax.device_put(np.asarray(value, dtype))
 
 
 @jax.tree_util.register_dataclass
@@ -77,7 +88,7 @@ def make_stereo_camera(
             )
     if width_px < 1 or height_px < 1:
         raise JaxmapError(f"image size {width_px}x{height_px}", where=where, fix="give a positive size")
-    leaves = {name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()}
+    leaves = {name: to_device(value, np.float32) for name, value in numbers.items()}
     return StereoCamera(**leaves, width_px=int(width_px), height_px=int(height_px))
 
 
@@ -136,8 +147,8 @@ def make_grid(lower_m: Sequence[float], upper_m: Sequence[float], voxel_size_m: 
     if counts.max() > MAX_TENSOR_ELEMENTS:
         raise JaxmapError(f"{counts.max():.3g} voxels along one axis", where="grid", fix="take larger voxels")
     return GridSpec(
-        origin_m=jnp.asarray(lower, jnp.float32),
-        voxel_size_m=jnp.asarray(size, jnp.float32),
+        origin_m=to_device(lower, np.float32),
+        voxel_size_m=to_device(size, np.float32),
         shape=(int(counts[0]), int(counts[1]), int(counts[2])),
     )
 
@@ -174,7 +185,7 @@ def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0) -> 
         )
     return VoxelMap(
         log_odds=jnp.zeros(shape, jnp.float32),
-        frames_fused=jnp.zeros((), jnp.int32),
+        frames_fused=to_device(0, np.int32),
         grid=grid,
         classes=tuple(classes),
         members=jnp.zeros((members, 2, *grid.shape), jnp.float32) if members else None,

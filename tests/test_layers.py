@@ -17,6 +17,8 @@ FLOORS = {
     "jaxmap.labels": 0,
     "jaxmap.files": 0,
     "jaxmap.prefetch": 0,
+    "jaxmap.precision": 0,
+    "jaxmap.stages": 0,
     # 1: pure geometry, host stereo, networks
     "jaxmap.geometry": 1,
     "jaxmap.localisation": 1,
@@ -49,6 +51,7 @@ FLOORS = {
     "jaxmap.config": 6,
     "jaxmap.cache": 6,
     "jaxmap.host_memory": 6,
+    "jaxmap.profiling": 6,
     # 7: runs
     "jaxmap.output_folder": 7,
     "jaxmap.training_folder": 7,
@@ -60,6 +63,7 @@ FLOORS = {
     "jaxmap.tuning_plan": 7,
     "jaxmap.tuning_run": 7,
     "jaxmap.run_folder": 7,
+    "jaxmap.run_log": 7,
     "jaxmap.run_outputs": 7,
     "jaxmap.mapping": 7,
     "jaxmap.mapping_grid": 7,
@@ -109,6 +113,8 @@ SAME_FLOOR = {
     ("jaxmap.map_training_plan", "jaxmap.segmentation"),
     ("jaxmap.map_training_plan", "jaxmap.training_plan"),
     ("jaxmap.run_folder", "jaxmap.output_folder"),
+    ("jaxmap.run_folder", "jaxmap.run_log"),
+    ("jaxmap.mapping", "jaxmap.run_log"),
     ("jaxmap.mapping", "jaxmap.output_folder"),
     ("jaxmap.map_evaluation", "jaxmap.output_folder"),
     ("jaxmap.tuning_run", "jaxmap.output_folder"),

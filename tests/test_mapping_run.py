@@ -103,7 +103,7 @@ def test_the_metrics_tell_the_run(finished_run):
     assert metrics["sequence"]["path_length_m"] == 1.25
     assert metrics["camera"]["baseline_m"] == BASELINE_M
     assert metrics["labeller"] == "plane"
-    assert set(metrics["times"]["stages"]) == {"read", "rectify", "match", "step"}
+    assert set(metrics["times"]["stages"]) == {"read", "rectify", "match", "wait", "step"}
     voxels = metrics["voxels"]
     assert voxels["observed"] == voxels["occupied"] + voxels["free"]
     assert voxels["occupied"] == len(voxels_of(finished_run).label)

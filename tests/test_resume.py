@@ -61,7 +61,7 @@ def same_run(run: Path, whole: Path) -> None:
     progress, expected_progress = (load_map(path / "map.zarr")[1].progress for path in (run, whole))
     for part in ("next_index", "fused", "skipped", "valid_fractions", "points_fused", "complete"):
         assert progress[part] == expected_progress[part], part
-    assert all(len(times) == FRAMES for times in progress["stages_ms"].values())
+    assert all(len(times["kept"]) == times["count"] == FRAMES for times in progress["stages_ms"].values())
 
 
 def contents(folder: Path) -> dict[Path, bytes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from dataclasses import replace
@@ -9,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fixtures import FRAMES, scene_copy, scene_folder, shared_cache  # noqa: F401
+from hypothesis import given
+from hypothesis import strategies as st
 from scenes import scene_frame
 from test_mapping_run import planned
 
@@ -94,6 +97,64 @@ def test_an_endless_source_is_read_no_further_than_needed():
     assert [next(results) for _ in range(5)] == [1, 2, 3, 4, 5]
     assert read <= 5 + 4
     results.close()
+    assert own_threads() == []
+
+
+@given(
+    count=st.integers(0, 25),
+    workers=st.integers(1, 4),
+    ahead=st.integers(1, 8),
+    stop=st.none() | st.integers(0, 25),
+    failing=st.none() | st.integers(0, 25),
+    seed=st.integers(0, 2**16),
+)
+def test_whatever_the_delays_order_bound_and_end_hold(count, workers, ahead, stop, failing, seed):
+    """A slow consumer holds the work back, an early end leaves no thread, a fault comes in its item's place."""
+    pause_s = np.random.default_rng(seed).choice([0.0, 0.0, 0.001], (2, 26))
+    begun, taken, most, lock = 0, 0, 0, threading.Lock()
+
+    def work(number: int) -> int:
+        nonlocal begun, most
+        with lock:
+            begun += 1
+            most = max(most, begun - taken)
+        time.sleep(pause_s[0, number])
+        if number == failing:
+            raise ValueError(number)
+        return number
+
+    results, got, failed = prefetch(work, range(count), workers, ahead), [], False
+    try:
+        for number in results:
+            got.append(number)
+            time.sleep(pause_s[1, number])
+            with lock:
+                taken += 1
+            if number == stop:
+                break
+    except ValueError:
+        failed = True
+    results.close()
+    ends = [end for end in (count, failing, None if stop is None else stop + 1) if end is not None]
+    assert got == list(range(min(ends)))
+    assert failed == (failing is not None and failing < count and failing == min(ends))
+    # The result that the consumer holds is one more.
+    assert most <= ahead + 1
+    assert own_threads() == []
+
+
+def test_the_first_items_are_begun_before_one_is_asked_for():
+    begun = threading.Semaphore(0)
+    results = prefetch(lambda number: begun.release(), range(10), 2, 3)
+    for _ in range(3):
+        assert begun.acquire(timeout=5)
+    assert not begun.acquire(timeout=0.05)
+    results.close()
+
+
+def test_a_generator_that_nobody_asks_leaves_no_threads():
+    prefetch(str, range(10), 2, 4)
+    gc.collect()
     assert own_threads() == []
 
 

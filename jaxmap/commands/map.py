@@ -41,6 +41,9 @@ class MapArguments:
     """Replace a run that lies in the folder."""
     checkpoint_every_s: float = 30.0
     """How often the map is saved on the way."""
+    profile: bool = False
+    """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
+    TensorBoard), and tell where the time of a step goes; docs/performance.md explains it."""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
 
 
@@ -59,7 +62,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.mapping_plan import plan_run
     from jaxmap.run_folder import RunFolder
 
-    keep_compiled_programs()
+    keep_compiled_programs(scopes=arguments.profile)
     # What ends a job on a cluster or a service is told like Ctrl-C: the map is saved first.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
@@ -75,11 +78,13 @@ def main(words: Sequence[str]) -> int:
             checkpoint_every_s=arguments.checkpoint_every_s,
             tell=console.tell,
             on_frame=advance,
+            profile=arguments.profile,
         )
     console.tell(summary(metrics))
     for skipped in metrics["sequence"]["skipped"]:
         console.tell(f"skipped {skipped['frame']}: {skipped['reason']}")
-    console.result(arguments.out, (*OUTPUTS, *(["missed.png"] if config.ensemble.members else [])))
+    missed, profile = ["missed.png"] if config.ensemble.members else [], ["profile/"] if arguments.profile else []
+    console.result(arguments.out, (*OUTPUTS, *missed, *profile))
     return 0
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxmap.errors import JaxmapError
+from jaxmap.types import to_device
 
 
 @jax.tree_util.register_dataclass
@@ -140,8 +140,8 @@ def make_fusion_params(
         )
     priors = np.broadcast_to(priors, (count,))
 
-    def leaf(value: object) -> Array:
-        return jnp.asarray(value, jnp.float32)
+    def leaf(value: ArrayLike) -> Array:
+        return to_device(value, np.float32)
 
     return FusionParams(
         occupancy_hit=leaf(occupancy_hit),

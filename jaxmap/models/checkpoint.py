@@ -14,7 +14,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
-import jax.numpy as jnp
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
@@ -23,6 +22,7 @@ from jaxmap.files import atomic_path
 from jaxmap.models.architecture import Architecture, check_architecture
 from jaxmap.models.deeplab import Weights, weight_shapes
 from jaxmap.models.tensor_files import as_float32, read_safetensors, shortened
+from jaxmap.types import to_device
 
 FORMAT_VERSION = 1
 
@@ -91,7 +91,7 @@ def load_model(path: str | PathLike[str]) -> SavedModel:
     architecture, holds = _read_record(metadata, path)
     tensors = {name: as_float32(value) for name, value in tensors.items()}
     check_weights(architecture, tensors, holds=holds, where=path)
-    return SavedModel(architecture, {name: jnp.asarray(value) for name, value in tensors.items()}, holds)
+    return SavedModel(architecture, {name: to_device(value) for name, value in tensors.items()}, holds)
 
 
 def load_network(path: str | PathLike[str]) -> SavedModel:

@@ -21,9 +21,13 @@ from jaxmap.models.mobilenet_v2 import MobileNetV2
 from jaxmap.models.resnet import ResNet
 from jaxmap.models.winograd import transformed_kernel
 from jaxmap.models.xception import Xception65
+from jaxmap.types import to_device
 
 Weights = dict[str, Array]
 """The arrays of a network by their dotted path, such as `backbone.units.3.expand.kernel`."""
+
+AnyArray = Array | np.ndarray
+"""Of JAX or of NumPy."""
 
 Images = UInt8[Array, "B H W 3"] | Float[Array, "B H W 3"]
 """RGB, 0 to 255, of any size."""
@@ -90,8 +94,13 @@ def make_network(architecture: Architecture, key: PRNGKeyArray) -> DeepLab:
     Raises:
         JaxmapError: no such network can be built.
     """
-    network = nnx.eval_shape(lambda: DeepLab(check_architecture(architecture)))
-    return _filled(network, initial_weights(architecture, key))
+    return _filled(_skeleton(check_architecture(architecture)), initial_weights(architecture, key))
+
+
+@cache
+def _skeleton(architecture: Architecture) -> DeepLab:
+    """A network of shapes alone, to be filled; never to be changed."""
+    return nnx.eval_shape(lambda: DeepLab(architecture))
 
 
 def initial_weights(architecture: Architecture, key: PRNGKeyArray) -> Weights:
@@ -136,7 +145,11 @@ class PureNetwork(NamedTuple):
 
 def pure_form(network: DeepLab) -> PureNetwork:
     """Splits a network once, so that its calls cost no Python when they are jitted."""
-    skeleton = nnx.eval_shape(lambda: DeepLab(network.record))
+    return _pure_form(network.record, network_weights(network))
+
+
+def _pure_form(architecture: Architecture, weights: Weights) -> PureNetwork:
+    skeleton = _skeleton(architecture)
 
     def apply(weights: Weights, images: Images) -> Array:
         return _filled(skeleton, weights)(images)
@@ -144,7 +157,7 @@ def pure_form(network: DeepLab) -> PureNetwork:
     def apply_coarse(weights: Weights, images: Images) -> Array:
         return _filled(skeleton, weights).coarse_logits(images)
 
-    return PureNetwork(network.record, network_weights(network), apply, apply_coarse)
+    return PureNetwork(architecture, weights, apply, apply_coarse)
 
 
 def training_form(
@@ -161,7 +174,7 @@ def training_form(
         `(weights, images, dropout_key) -> (logits, statistics)`: the running statistics after the batch, by
         dotted path.
     """
-    skeleton = nnx.eval_shape(lambda: DeepLab(architecture))
+    skeleton = _skeleton(architecture)
 
     def apply(weights: Weights, images: Images, dropout_key: PRNGKeyArray) -> tuple[Array, Weights]:
         network = _filled(skeleton, weights)
@@ -186,18 +199,19 @@ def network_weights(network: DeepLab) -> Weights:
 @cache
 def weight_shapes(architecture: Architecture) -> Mapping[str, tuple[int, ...]]:
     """Shape of every weight of a network, by dotted path, without allocating any."""
-    network = nnx.eval_shape(lambda: DeepLab(architecture))
-    return MappingProxyType({name: tuple(leaf.shape) for name, leaf in network_weights(network).items()})
+    shapes = network_weights(_skeleton(architecture))
+    return MappingProxyType({name: tuple(leaf.shape) for name, leaf in shapes.items()})
 
 
 def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
     """The pure form of a network with given weights, which must be complete."""
-    network = nnx.eval_shape(lambda: DeepLab(architecture))
-    arrays = {name: jnp.asarray(value) for name, value in weights.items()}
-    return pure_form(network)._replace(weights=arrays)
+    arrays = {name: value if isinstance(value, Array) else to_device(value) for name, value in weights.items()}
+    return _pure_form(architecture, arrays)
 
 
-def fold_batch_norm(architecture: Architecture, weights: Weights) -> tuple[Architecture, Weights]:
+def fold_batch_norm(
+    architecture: Architecture, weights: Mapping[str, AnyArray]
+) -> tuple[Architecture, dict[str, AnyArray]]:
     """The same network without batch norm: its scale and shift go into the convolutions before it.
 
     `w (x - mean) scale / sqrt(var + eps) + bias` is a convolution of kernel `w scale / sqrt(var + eps)`.
@@ -208,7 +222,8 @@ def fold_batch_norm(architecture: Architecture, weights: Weights) -> tuple[Archi
         if leaf != "mean":
             continue
         eps = architecture.backbone_eps if block.startswith("backbone.") else architecture.head_eps
-        gain = weights[f"{block}.norm.scale"] * jax.lax.rsqrt(weights[f"{block}.norm.var"] + eps)
+        # In operators that NumPy's arrays have, too: on the host nothing needs to be compiled for it.
+        gain = weights[f"{block}.norm.scale"] / (weights[f"{block}.norm.var"] + eps) ** 0.5
         result[f"{block}.kernel"] = weights[f"{block}.kernel"] * gain
         result[f"{block}.bias"] = weights[f"{block}.norm.bias"] - mean * gain
     return folded(architecture), result
@@ -219,10 +234,10 @@ def inference_network(architecture: Architecture, weights: Mapping[str, ArrayLik
 
     Batch norm is folded, and on a CPU the kernels of large dense convolutions are transformed (`winograd`).
     """
-    architecture, result = fold_batch_norm(architecture, {name: jnp.asarray(value) for name, value in weights.items()})
+    architecture, result = fold_batch_norm(architecture, {name: np.asarray(value) for name, value in weights.items()})
     if jax.default_backend() == "cpu":
-        for path, block in nnx.iter_modules(nnx.eval_shape(lambda: DeepLab(architecture))):
+        for path, block in nnx.iter_modules(_skeleton(architecture)):
             if isinstance(block, ConvBlock) and block.transformable:
                 name = ".".join(map(str, (*path, "kernel")))
-                result[name] = transformed_kernel(result[name])
+                result[name] = transformed_kernel(jnp.asarray(result[name]))
     return pure_network(architecture, result)

@@ -85,7 +85,8 @@ def _header(folder: RunContents, voxels: OccupiedVoxels) -> str:
     progress = folder.attributes.progress
     banner = ""
     if progress.get("complete") is False:
-        told = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in progress.items() if key != "complete")
+        numbers = {key: value for key, value in progress.items() if isinstance(value, int) and key != "complete"}
+        told = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in numbers.items())
         how_far = escape(f" ({told})" if told else "")
         banner = f'<p class="banner">This run was interrupted{how_far}: the map is of its first part.</p>'
     stats = "".join(f"<div><dt>{name}</dt><dd>{text}</dd></div>" for name, text in _stats(folder, voxels))

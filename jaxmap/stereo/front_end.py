@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.labels import IGNORE
+from jaxmap.stages import timed_stage
 from jaxmap.stereo.match import Matcher
 from jaxmap.stereo.options import StereoOptions
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
@@ -54,7 +54,6 @@ class StereoFrontEnd:
         Raises:
             FrameError: the sizes disagree with each other or with the calibration.
         """
-        started_s = time.perf_counter()
         expected = (self.camera.height_px, self.camera.width_px)
         for side, image in (("left", left), ("right", right)):
             if image.shape[:2] != expected:
@@ -63,15 +62,16 @@ class StereoFrontEnd:
                     f"{expected[1]}x{expected[0]} px",
                     fix="give the calibration of these images",
                 )
-        if self.rectifier is not None:
-            left = rectify_image(left, self.rectifier.left_maps)
-            right = rectify_image(right, self.rectifier.right_maps)
-        rectified_s = time.perf_counter()
-        disparity_px = self.matcher(left, right)
-        if self.rectifier is not None:
-            disparity_px[~self.rectifier.seen] = np.nan
-        matched_s = time.perf_counter()
-        return RectifiedFrame(left, right, disparity_px, rectified_s - started_s, matched_s - rectified_s)
+        stages_s: dict[str, float] = {}
+        with timed_stage("rectify", stages_s):
+            if self.rectifier is not None:
+                left = rectify_image(left, self.rectifier.left_maps)
+                right = rectify_image(right, self.rectifier.right_maps)
+        with timed_stage("match", stages_s):
+            disparity_px = self.matcher(left, right)
+            if self.rectifier is not None:
+                disparity_px[~self.rectifier.seen] = np.nan
+        return RectifiedFrame(left, right, disparity_px, stages_s["rectify"], stages_s["match"])
 
     def check_order(self, frame: RectifiedFrame, where: object = "") -> None:
         """Refuses pairs whose left and right images are swapped.

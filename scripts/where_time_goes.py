@@ -1,0 +1,65 @@
+"""Where the time of the compiled step goes, stage by stage, against what memory and arithmetic of this machine reach.
+
+    python scripts/where_time_goes.py [SEQUENCE] [--config NAME] [--labeller plane] [--frames 13] [--json F]
+
+The frames are read and matched beforehand: while the steps are traced, nothing else runs in this process (`jaxmap map
+--profile` tells the same of a whole run, with reading and matching beside it). docs/performance.md says how to read it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from dataclasses import replace
+from itertools import cycle, islice
+from pathlib import Path
+
+import jax
+
+from jaxmap.cache import keep_compiled_programs
+from jaxmap.config import load_config
+from jaxmap.host_memory import restart_with_lasting_memory
+from jaxmap.mapper import compile_step
+from jaxmap.mapping_plan import plan_run
+from jaxmap.profiling.step_profile import TRACED_FRAMES, WARM_UP_FRAMES, StepProfile, table_lines
+from jaxmap.sequence import prepare_frames
+
+
+def main() -> None:
+    """Measures one labeller and prints its table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequence", nargs="?", default="sample:traverse")
+    parser.add_argument("--config", default="katwijk")
+    parser.add_argument("--labeller", default="plane", choices=["none", "plane", "deeplab"])
+    parser.add_argument("--frames", type=int, default=4, help="different frames, used in turn")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    # As the command does: a step whose memory comes fresh from the system at each frame is another one.
+    restart_with_lasting_memory()
+    keep_compiled_programs(scopes=True)
+    config = replace(load_config(given.config), labeller=given.labeller, stop=given.frames)
+    plan = plan_run(given.sequence, config, print)
+    prepared = list(prepare_frames(plan.sequence, plan.front_end, needs=plan.labeller.needs))
+    frames = [one.frame for one in prepared if one.frame is not None]
+    voxel_map = plan.mapper.init()
+    mapper, cost = compile_step(plan.mapper, voxel_map, frames[0], plan.params, plan.key)
+    with tempfile.TemporaryDirectory() as folder:
+        profile, times_s = StepProfile(Path(folder)), []
+        for frame in islice(cycle(frames), WARM_UP_FRAMES + TRACED_FRAMES):
+            started_s = time.perf_counter()
+            voxel_map, _ = mapper.step(voxel_map, frame, plan.params, plan.key)
+            jax.block_until_ready(voxel_map.log_odds)
+            times_s.append(time.perf_counter() - started_s)
+            profile.step_done()
+        summary = profile.summary(cost.program)
+    step_ms = 1e3 * sorted(times_s[WARM_UP_FRAMES:])[TRACED_FRAMES // 2]
+    assert summary is not None
+    print("\n".join([f"labeller {given.labeller}: a step takes {step_ms:.1f} ms, traced", *table_lines(summary)]))
+    if given.json:
+        given.json.write_text(json.dumps({**summary, "step_ms": round(step_ms, 3)}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
