@@ -27,7 +27,7 @@ from jaxmap.mapping_grid import choose_grid, told_grid
 from jaxmap.mapping_labels import ModelFile, choose_label_folder, choose_labeller, choose_model, told_network
 from jaxmap.sequence import frame_form
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.types import Frame, GridSpec
+from jaxmap.types import Frame, GridSpec, StereoCamera
 
 Tell = Callable[[str], None]
 
@@ -111,31 +111,15 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     sequence = open_sequence(source, options)
     front_end = StereoFrontEnd(sequence.camera, config.stereo)
     camera = front_end.camera
-    tell(
-        f"{sequence.name} ({sequence.dataset}): {len(sequence.frames)} frames "
-        f"of {camera.width_px} x {camera.height_px} px, f {float(camera.fx_px):.2f} px, "
-        f"baseline {float(camera.baseline_m):.5f} m"
-    )
-    for note in sequence.notes:
-        tell(f"note: {note}")
-    if sequence.site_origin.any():
-        origin = " ".join(f"{number:.0f}" for number in sequence.site_origin)
-        tell(f"site origin {origin} ({sequence.crs or 'no CRS given: --crs'}); bounds are relative to it")
-
-    max_depth_m = config.depth.max_m or usable_depth(camera, config.depth.max_sigma_m, config.fusion.disparity_sigma_px)
-    if not config.depth.min_m < max_depth_m:
-        raise UsageError(
-            f"depth.min_m {config.depth.min_m} is not below the greatest depth, {max_depth_m} m",
-            fix="set --depth.max-m",
-        )
-    depth_range_m = (config.depth.min_m, max_depth_m)
+    _tell_sequence(sequence, camera, tell)
+    depth_range_m = _depth_range(config, camera)
     label_folder = choose_label_folder(config, sequence)
     model, network = choose_model(config)
     with _as_usage_error():
         labeller = choose_labeller(config, label_folder, network)
         if model is not None and network is not None:
             tell(told_network(model, network, labeller.classes))
-        grid = choose_grid(config, sequence, front_end, max_depth_m, len(labeller.classes))
+        grid = choose_grid(config, sequence, front_end, depth_range_m[1], len(labeller.classes))
         params, rule = split_fusion(config.fusion, labeller.classes)
         fusion_rule = FusionRule(**rule)
         fusion_params = make_fusion_params(labeller.classes, **params)
@@ -173,6 +157,35 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
         key=key,
         pose_errors=pose_errors,
     )
+
+
+def _tell_sequence(sequence: StereoSequence, camera: StereoCamera, tell: Tell) -> None:
+    """What was opened, what its reader noted, and where its world begins."""
+    tell(
+        f"{sequence.name} ({sequence.dataset}): {len(sequence.frames)} frames "
+        f"of {camera.width_px} x {camera.height_px} px, f {float(camera.fx_px):.2f} px, "
+        f"baseline {float(camera.baseline_m):.5f} m"
+    )
+    for note in sequence.notes:
+        tell(f"note: {note}")
+    if sequence.site_origin.any():
+        origin = " ".join(f"{number:.0f}" for number in sequence.site_origin)
+        tell(f"site origin {origin} ({sequence.crs or 'no CRS given: --crs'}); bounds are relative to it")
+
+
+def _depth_range(config: MapConfig, camera: StereoCamera) -> tuple[float, float]:
+    """The depths that are mapped, in metres; without a greatest one, as far as the camera is good for.
+
+    Raises:
+        UsageError: there is nothing between them.
+    """
+    max_depth_m = config.depth.max_m or usable_depth(camera, config.depth.max_sigma_m, config.fusion.disparity_sigma_px)
+    if not config.depth.min_m < max_depth_m:
+        raise UsageError(
+            f"depth.min_m {config.depth.min_m} is not below the greatest depth, {max_depth_m} m",
+            fix="set --depth.max-m",
+        )
+    return config.depth.min_m, max_depth_m
 
 
 def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int:

@@ -111,7 +111,13 @@ def test_a_peer_that_is_not_installed_is_left_out_and_named():
 @given(RATIOS, RATIOS)
 def test_the_bound_lies_between_nine_tenths_of_the_limit_and_the_limit(limit: float, ratio: float):
     assert bound(limit, None) == limit
-    assert 0.9 * limit <= bound(limit, ratio) <= limit
+    assert 0.9 * limit <= bound(limit, min(ratio, limit)) <= limit
+
+
+@given(RATIOS, RATIOS)
+def test_where_the_baseline_misses_the_limit_it_must_get_no_worse(limit: float, ratio: float):
+    missed = max(ratio, 1.001 * limit)
+    assert missed < bound(limit, missed) < 1.3 * missed
 
 
 @given(RATIOS, RATIOS, RATIOS)
@@ -120,7 +126,7 @@ def test_a_better_baseline_never_loosens_the_bound(limit: float, one: float, oth
     assert bound(limit, better) <= bound(limit, worse)
 
 
-@pytest.mark.parametrize(("ratio", "expected"), [(0.1, 0.9), (0.62, 0.93), (0.8, 1.0)])
+@pytest.mark.parametrize(("ratio", "expected"), [(0.1, 0.9), (0.62, 0.93), (0.8, 1.0), (1.2, 1.5)])
 def test_the_bound_follows_the_baseline(ratio: float, expected: float):
     assert bound(1.0, ratio) == pytest.approx(expected)
 

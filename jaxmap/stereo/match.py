@@ -66,8 +66,8 @@ class Matcher:
             left = cv2.copyMakeBorder(left, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
             right = cv2.copyMakeBorder(right, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
         raw = self._engine().compute(left, right)[:, pad:]
-        disparity_px = raw.astype(np.float32) / _SUBPIXELS
-        disparity_px[raw < self.options.min_disparity_px * _SUBPIXELS] = np.nan
+        disparity_px = np.multiply(raw, np.float32(1 / _SUBPIXELS), dtype=np.float32)
+        np.copyto(disparity_px, np.nan, where=raw < self.options.min_disparity_px * _SUBPIXELS)
         return disparity_px
 
     def looks_swapped(self, left: np.ndarray, right: np.ndarray, disparity_px: np.ndarray) -> bool:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 Cases = Mapping[str, Mapping[str, Any]]
 """Results of `harness.measure` by the names of the cases."""
 
-SLACK, FLOOR = 1.5, 0.9
+SLACK, FLOOR, MISSED_SLACK = 1.5, 0.9, 1.25
 
 
 class Verdict(NamedTuple):
@@ -29,10 +29,13 @@ def bound(limit: float, baseline_ratio: float | None) -> float:
     """The ratio that must not be passed.
 
     The smaller of the limit and 1.5 times the ratio in the committed baseline, but never tighter than 0.9 times the
-    limit: machines are noisy, ratios less so.
+    limit: machines are noisy, ratios less so. Where the baseline itself misses the limit, the page and the table say
+    so, and the gate is that it gets no worse: 1.25 times that ratio.
     """
     if baseline_ratio is None:
         return limit
+    if baseline_ratio > limit:
+        return MISSED_SLACK * baseline_ratio
     return min(limit, max(SLACK * baseline_ratio, FLOOR * limit))
 
 
