@@ -60,7 +60,7 @@ def lively_weights(architecture: Architecture) -> dict[str, np.ndarray]:
     ("family", "backbone"),
     [
         ("torch", "mobilenet_v2"),
-        ("tf", "mobilenet_v2"),
+        pytest.param("tf", "mobilenet_v2", marks=slow),
         pytest.param("torchvision", "resnet18", marks=slow),
         pytest.param("torch", "resnet50", marks=slow),
         pytest.param("tf", "xception65", marks=slow),
