@@ -83,10 +83,10 @@ def in_process(words: list[str], cache: Path | None = None) -> tuple[str, dict[s
     return done.stdout, {"wall_s": after.elapsed - before.elapsed, "processor_s": spent_s}
 
 
-def first_frame(sequence: str, config: str, labeller: str, cache: Path) -> dict[str, Any]:
+def first_frame(sequence: str, config: str | None, labeller: str, cache: Path) -> dict[str, Any]:
     """What the first frame of one run took."""
     with tempfile.TemporaryDirectory() as out:
-        options = ["--config", config, "--labeller", labeller, "--out", f"{out}/run"]
+        options = [*(["--config", config] if config else []), "--labeller", labeller, "--out", f"{out}/run"]
         printed, _ = in_process([__file__, "--first-frame", sequence, *options], cache)
     return json.loads(printed.splitlines()[-1])
 
@@ -111,7 +111,7 @@ def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sequence", default="sample:traverse")
-    parser.add_argument("--config", default="katwijk")
+    parser.add_argument("--config", help="YAML file, or the name of a bundled one")
     parser.add_argument("--labellers", nargs="+", default=["none", "plane", "deeplab"])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", type=Path)

@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 
 from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import load_config
+from jaxmap.config import MapConfig, load_config
 from jaxmap.host_memory import restart_with_lasting_memory
 from jaxmap.mapper import compile_step
 from jaxmap.mapping_plan import plan_run
@@ -31,7 +31,7 @@ def main() -> None:
     """Measures one labeller and prints its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", default="sample:traverse")
-    parser.add_argument("--config", default="katwijk")
+    parser.add_argument("--config", help="YAML file, or the name of a bundled one")
     parser.add_argument("--labeller", default="plane", choices=["none", "plane", "deeplab"])
     parser.add_argument("--frames", type=int, default=4, help="different frames, used in turn")
     parser.add_argument("--json", type=Path)
@@ -39,7 +39,9 @@ def main() -> None:
     # As the command does: a step whose memory comes fresh from the system at each frame is another one.
     restart_with_lasting_memory()
     keep_compiled_programs(scopes=True)
-    config = replace(load_config(given.config), labeller=given.labeller, stop=given.frames)
+    config = replace(
+        load_config(given.config) if given.config else MapConfig(), labeller=given.labeller, stop=given.frames
+    )
     plan = plan_run(given.sequence, config, print)
     prepared = list(prepare_frames(plan.sequence, plan.front_end, needs=plan.labeller.needs))
     frames = [one.frame for one in prepared if one.frame is not None]
