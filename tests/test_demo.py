@@ -24,11 +24,12 @@ MIB = 2**20
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory, shared_cache):
-    out = tmp_path_factory.mktemp("demo")
+    work = tmp_path_factory.mktemp("demo")
     # In a process of its own, so that the memory it tells is its own.
     environment = {**os.environ, "JAXMAP_CACHE": str(shared_cache)}
-    subprocess.run([sys.executable, "-m", "jaxmap", "demo", "--out", str(out)], env=environment, check=True)
-    return out
+    # As it stands in the README: into a folder of the current one.
+    subprocess.run([sys.executable, "-m", "jaxmap", "demo"], cwd=work, env=environment, check=True)
+    return work / "jaxmap_demo"
 
 
 def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
@@ -37,6 +38,7 @@ def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
         (labeller, preset) for labeller in ("plane", "deeplab") for preset in ("chiodini2020", "default")
     ]
     for row in rows:
+        assert row["run"] == f"{row['labeller']}_{row['preset']}"
         assert row["accuracy"] == (row["tp"] + row["tn"]) / (row["tp"] + row["tn"] + row["fp"] + row["fn"])
         assert row["iou"] == row["tp"] / (row["tp"] + row["fp"] + row["fn"])
         assert row["frames_per_s"] > 0 and row["peak_resident_mib"] < 4096

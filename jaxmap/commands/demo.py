@@ -65,7 +65,7 @@ def main(words: Sequence[str]) -> int:
     for name, (labeller, preset, config) in demo_rows().items():
         console.tell(f"--- {labeller}, {preset} ---")
         metrics, scores = _map_and_score(arguments.out / name, config, truth, console)
-        table.append({"run": name, "labeller": labeller, "preset": preset, **scores, **_figures(metrics)})
+        table.append({**scores, **_figures(metrics), "run": name, "labeller": labeller, "preset": preset})
     write_json(arguments.out / "table.json", table)
     write_demo_page(arguments.out, TITLE, COLUMNS, table, truth)
     console.table(TITLE, COLUMNS, table)
