@@ -1,6 +1,5 @@
 from .datasets import ReadOptions, StereoSequence, open_sequence
 from .datasets.images import read_image
-from .deeplab_labeller import make_deeplab_labeller
 from .ensemble.draws import draw_ensemble
 from .ensemble.layer import EnsembleLayers, ensemble_layers
 from .ensemble.options import EnsembleOptions
@@ -12,16 +11,19 @@ from .fusion.query import TopDown, class_probabilities, occupancy_probability, t
 from .geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
 from .geometry.grid import voxel_centres, world_to_voxel
 from .geometry.plane import fit_plane_mlesac, plane_distance
-from .labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
+from .labellers.base import Labeller, make_no_labeller
+from .labellers.deeplab import make_deeplab_labeller
+from .labellers.files import make_files_labeller
+from .labellers.plane import make_plane_labeller
 from .labels import IGNORE, ROVER_CLASSES
-from .map_store import MapAttributes, load_map, save_map
-from .mapper import Mapper, MapperParams, make_mapper
+from .mapping.sequence import prepare_frames, run_sequence
+from .mapping.step import Mapper, MapperParams, make_mapper
+from .mapping.store import MapAttributes, load_map, save_map
 from .models.architecture import Architecture, tf_architecture, torch_architecture, torchvision_architecture
 from .models.checkpoint import SavedModel, load_model, load_network, save_model
 from .models.deeplab import PureNetwork, fold_batch_norm, make_network, pure_form, pure_network
 from .models.importers import import_weights
-from .segmentation import Segmenter
-from .sequence import prepare_frames, run_sequence
+from .runs.segmentation import Segmenter
 from .stereo.front_end import StereoFrontEnd
 from .stereo.options import StereoOptions
 from .stereo.rectify import make_stereo_rig

@@ -2,6 +2,6 @@
 
 import sys
 
-from jaxmap.cli import main
+from jaxmap.commands.main import main
 
 sys.exit(main())

@@ -46,7 +46,7 @@ def main() -> int:
     arguments = parse()
     sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "golden")]
     if not (arguments.list or arguments.from_json):
-        from jaxmap.host_memory import restart_with_lasting_memory
+        from jaxmap.host.memory import restart_with_lasting_memory
 
         restart_with_lasting_memory()
     limit_threads(arguments.threads)

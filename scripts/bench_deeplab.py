@@ -23,7 +23,7 @@ from pathlib import Path
 from benchmarks.harness import Run as Runner
 from benchmarks.harness import in_turn, timed
 from benchmarks.threads import limit_threads
-from jaxmap.host_memory import restart_with_lasting_memory
+from jaxmap.host.memory import restart_with_lasting_memory
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZES = ((384, 512), (512, 512))

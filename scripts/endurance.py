@@ -28,14 +28,14 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import check_config
 from jaxmap.datasets.base import FrameRef, StereoPair
 from jaxmap.datasets.pose_files import write_tum
-from jaxmap.mapping import run_plan
-from jaxmap.mapping_plan import Plan, plan_run
-from jaxmap.run_folder import RunFolder
-from jaxmap.sequence import FusedFrame
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.mapping.sequence import FusedFrame
+from jaxmap.runs.config import check_config
+from jaxmap.runs.folder import RunFolder
+from jaxmap.runs.mapping import run_plan
+from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
 
 VIEWS = 12

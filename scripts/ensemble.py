@@ -21,15 +21,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import DepthConfig, MapConfig
 from jaxmap.ensemble.layer import ensemble_layers
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
-from jaxmap.files import bundled
-from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.mapping_plan import plan_run
-from jaxmap.sequence import PreparedFrame, prepare_frames, run_sequence
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.host.files import bundled
+from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
+from jaxmap.runs.config import DepthConfig, MapConfig
+from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.mapping_plan import plan_run
 
 CELL_M, RANGE_M = 0.2, 8.0
 NO_POSES = dict(position_sigma_m=0.0, heading_sigma_rad=0.0, tilt_sigma_rad=0.0)

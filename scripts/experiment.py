@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from ladder import COARSE, POINTS, confusions, fused
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import DepthConfig, MapConfig, load_config
 from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
 from jaxmap.evaluation.map_scores import confusion_scores
-from jaxmap.map_evaluation import TruthOptions, read_truth
-from jaxmap.mapping_plan import plan_run
-from jaxmap.sequence import PreparedFrame, prepare_frames
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.mapping.sequence import PreparedFrame, prepare_frames
+from jaxmap.runs.config import DepthConfig, MapConfig, load_config
+from jaxmap.runs.evaluation import TruthOptions, read_truth
+from jaxmap.runs.mapping_plan import plan_run
 
 SCENES = {"few": 201, "small": 202, "medium": 203}
 PAPER = {"deeplab": ((0.96, 0.58), (0.90, 0.21), (0.95, 0.36)), "plane": ((0.95, 0.37), (0.97, 0.58), (0.96, 0.47))}

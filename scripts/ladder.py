@@ -17,16 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import DepthConfig, FusionConfig, GridConfig, MapConfig, load_config
 from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.evaluation.cells import CellGrid, column_shares, make_cells, map_cells
 from jaxmap.evaluation.evaluate import ClassMap
 from jaxmap.evaluation.map_scores import Confusion, confusion_scores, count_confusion
 from jaxmap.evaluation.truth_cells import truth_cells
-from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.mapping_plan import Plan, plan_run
-from jaxmap.sequence import PreparedFrame, prepare_frames, run_sequence
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
+from jaxmap.runs.config import DepthConfig, FusionConfig, GridConfig, MapConfig, load_config
+from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.mapping_plan import Plan, plan_run
 
 POINTS = FusionConfig(per_frame="sum", carve=False, range_weighting=False, class_hit=1.0, class_miss=-1.0)
 """More rock points than others, over all frames: the majority."""

@@ -22,13 +22,13 @@ import numpy as np
 from ladder import confusions
 from PIL import Image
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import DeeplabConfig, DepthConfig, MapConfig
 from jaxmap.datasets.images import as_rgb, read_index_image
 from jaxmap.evaluation.map_scores import confusion_scores
-from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.mapping_plan import Plan, plan_run
-from jaxmap.sequence import PreparedFrame, prepare_frames, run_sequence
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
+from jaxmap.runs.config import DeeplabConfig, DepthConfig, MapConfig
+from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.mapping_plan import Plan, plan_run
 
 CELL_M, RANGE_M = 0.2, 8.0
 SIZE_PX = (384, 512)

@@ -25,12 +25,12 @@ from agreement.heights import NO_TRUTH, TRUTH_NAMES, true_voxels
 from agreement.maps import CLASS_NAMES, TwoMaps, map_both
 from agreement.picture import draw_agreement
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import MapConfig, load_config
 from jaxmap.errors import JaxmapError
-from jaxmap.mapping_plan import Plan, plan_run
-from jaxmap.output_folder import write_json
-from jaxmap.sequence import prepare_frames
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.host.output_folder import write_json
+from jaxmap.mapping.sequence import prepare_frames
+from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.types import Frame
 
 LEAST_AGREEMENT = 0.97

@@ -24,10 +24,10 @@ import numpy as np
 
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import top_down
-from jaxmap.host_memory import peak_resident_mib
-from jaxmap.labellers import make_files_labeller
+from jaxmap.host.memory import peak_resident_mib
+from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labels import ROVER_CLASSES
-from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.tuning.pull_back import make_pull_back, map_gradient
 from jaxmap.types import Frame, VoxelMap, make_grid, make_stereo_camera
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from jaxmap.cli import main as jaxmap_main
+from jaxmap.commands.main import main as jaxmap_main
 from jaxmap.export.voxels import occupied_voxels
 from jaxmap.report.demo_page import key_frame_row
 from jaxmap.report.html import in_3d

@@ -22,21 +22,21 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import DepthConfig, MapConfig
 from jaxmap.datasets import ReadOptions
 from jaxmap.datasets.pose_files import write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
 from jaxmap.geometry.bounds import usable_depth
-from jaxmap.map_evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.mapping_plan import plan_run
-from jaxmap.refine_run import DEPTH_SIGMA_M, GroundFiles, RefineInputs, ground_of, read_inputs
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.mapping.sequence import prepare_frames, run_sequence
 from jaxmap.refinement.rig import vehicle_axes
 from jaxmap.refinement.rounds import Ground, Refinement, refine
 from jaxmap.refinement.solve import Prior
 from jaxmap.refinement.views import pinhole
-from jaxmap.sequence import prepare_frames, run_sequence
+from jaxmap.runs.config import DepthConfig, MapConfig
+from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.mapping_plan import plan_run
+from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, ground_of, read_inputs
 
 POSITION_M, ANGLE_RAD = 0.2, np.radians(1.0)
 PITCH_RAD, HEIGHT_M = np.radians(2.0), 0.1

@@ -36,7 +36,7 @@ def age_s() -> float:
 
 def map_first_frame(words: list[str]) -> None:
     """`jaxmap map`, which ends as soon as a frame is in the map, and tells how long that took."""
-    from jaxmap import cli
+    from jaxmap.commands import main as cli
     from jaxmap.commands import map as command
 
     class Stopwatch(command.Console):

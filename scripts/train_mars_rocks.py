@@ -13,8 +13,8 @@ import argparse
 import json
 from pathlib import Path
 
-from jaxmap.cli import main as jaxmap
-from jaxmap.host_memory import restart_with_lasting_memory
+from jaxmap.commands.main import main as jaxmap
+from jaxmap.host.memory import restart_with_lasting_memory
 
 RUNS = {
     "pretrained": [],

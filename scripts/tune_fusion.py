@@ -21,15 +21,14 @@ from typing import Any
 import numpy as np
 from ladder import confusions, fused
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import DepthConfig, MapConfig, load_config
 from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
 from jaxmap.evaluation.map_scores import confusion_scores
-from jaxmap.map_evaluation import TruthOptions, read_truth
-from jaxmap.mapping_plan import plan_run
-from jaxmap.sequence import PreparedFrame, prepare_frames
-from jaxmap.tuning_plan import Source, TuneOptions
-from jaxmap.tuning_run import TuningRun
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.mapping.sequence import PreparedFrame, prepare_frames
+from jaxmap.runs.config import DepthConfig, MapConfig, load_config
+from jaxmap.runs.evaluation import TruthOptions, read_truth
+from jaxmap.runs.mapping_plan import plan_run
+from jaxmap.runs.tuning import Source, TuneOptions, TuningRun
 
 LABELS = {"true": "files", "deeplab": "deeplab", "plane": "plane"}
 CELL_M, RANGE_M = 0.2, 8.0

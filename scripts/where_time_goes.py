@@ -18,13 +18,13 @@ from pathlib import Path
 
 import jax
 
-from jaxmap.cache import keep_compiled_programs
-from jaxmap.config import MapConfig, load_config
-from jaxmap.host_memory import restart_with_lasting_memory
-from jaxmap.mapper import compile_step
-from jaxmap.mapping_plan import plan_run
+from jaxmap.host.cache import keep_compiled_programs
+from jaxmap.host.memory import restart_with_lasting_memory
+from jaxmap.mapping.sequence import prepare_frames
+from jaxmap.mapping.step import compile_step
 from jaxmap.profiling.step_profile import TRACED_FRAMES, WARM_UP_FRAMES, StepProfile, table_lines
-from jaxmap.sequence import prepare_frames
+from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.mapping_plan import plan_run
 
 
 def main() -> None:

@@ -18,14 +18,13 @@ NETWORK_MODULES = tuple(
 CHECKED_MODULES = (
     *FUSION_MODULES,
     *NETWORK_MODULES,
-    "deeplab_labeller",
     "evaluation.pose_scores",
     "evaluation.segmentation_scores",
     "geometry",
     "labellers",
     "labels",
     "localisation",
-    "mapper",
+    "mapping.step",
     "simulation",
     "stereo",
 )

@@ -18,8 +18,8 @@ import pytest
 import tyro
 from scenes import write_folder_sequence
 
-from jaxmap.cli import main
 from jaxmap.commands import COMMANDS
+from jaxmap.commands.main import main
 
 FRAMES = 6
 

@@ -14,16 +14,16 @@ from pathlib import Path
 import pytest
 
 import jaxmap
-import jaxmap.files
+import jaxmap.host.files
 
 SLOW_DISK = """\
-import sys, time, jaxmap.files
-from jaxmap.cli import main
-sync = jaxmap.files.sync
+import sys, time, jaxmap.host.files
+from jaxmap.commands.main import main
+sync = jaxmap.host.files.sync
 def slowly(path):
     time.sleep(2)
     sync(path)
-jaxmap.files.sync = slowly
+jaxmap.host.files.sync = slowly
 sys.exit(main(sys.argv[1:]))
 """
 """A program that runs a command whose files take a while to reach the disk: it can be killed in the midst of one."""
@@ -53,11 +53,11 @@ def kill_when(ready: Callable[[], object], program: str, words: Sequence[object]
 
 def fill_disk(patch: pytest.MonkeyPatch, name: str) -> None:
     """Lets the disk be full as soon as a file of this name is written; its temporary name keeps stem and suffix."""
-    sync, wanted = jaxmap.files.sync, Path(name)
+    sync, wanted = jaxmap.host.files.sync, Path(name)
 
     def full(path: Path) -> None:
         if path.name.startswith(f".{wanted.stem}.tmp-") and path.suffix == wanted.suffix:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         sync(path)
 
-    patch.setattr(jaxmap.files, "sync", full)
+    patch.setattr(jaxmap.host.files, "sync", full)

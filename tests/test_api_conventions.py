@@ -15,7 +15,7 @@ SOURCES = sorted((ROOT / "jaxmap").rglob("*.py"))
 MAX_FILE_LINES = 350
 MAX_FUNCTION_LINES = 70
 
-PRINTERS = ("jaxmap/cli.py", "jaxmap/commands/")
+PRINTERS = ("jaxmap/commands/main.py", "jaxmap/commands/")
 """Where the command line talks to the user."""
 
 FORBIDDEN_CALLS = {

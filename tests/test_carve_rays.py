@@ -21,8 +21,8 @@ from test_carve import SHARP, see_through, views
 from truth_files import CRS, SITE, write_raster
 
 from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.labellers import make_no_labeller
-from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.labellers.base import make_no_labeller
+from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.types import Frame, GridSpec, make_grid, make_stereo_camera
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts"))

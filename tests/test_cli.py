@@ -15,9 +15,9 @@ import yaml
 from fixtures import cli, finished_run, map_words, scene_folder, shared_cache  # noqa: F401
 
 import jaxmap
-from jaxmap.cache import cache_folder
 from jaxmap.commands import COMMANDS
-from jaxmap.config import MapConfig
+from jaxmap.host.cache import cache_folder
+from jaxmap.runs.config import MapConfig
 
 
 def python(program: str) -> subprocess.CompletedProcess[str]:
@@ -28,7 +28,7 @@ def python(program: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["map", "--help"], ["export", "--help"]])
 def test_help_and_version_need_neither_jax_nor_opencv(words):
     result = python(
-        f"import sys; from jaxmap.cli import main\n"
+        f"import sys; from jaxmap.commands.main import main\n"
         f"try: main({words!r})\n"
         f"except SystemExit as stop: assert not stop.code\n"
         f"print('LOADED', [name for name in ('jax', 'cv2', 'zarr', 'rasterio', 'matplotlib') if name in sys.modules])"
@@ -141,7 +141,7 @@ def test_the_module_runs_as_a_program():
 def test_a_reader_that_goes_away_is_no_fault():
     result = python(
         "import os, sys\n"
-        "from jaxmap.cli import main\n"
+        "from jaxmap.commands.main import main\n"
         "read, write = os.pipe(); os.close(read); os.dup2(write, 1)\n"
         "status = main(['info']); sys.stdout.flush(); sys.exit(status)"
     )

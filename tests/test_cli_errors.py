@@ -288,12 +288,12 @@ def test_a_faulty_input_leaves_the_run_that_is_there(cli, scene_copy, finished_r
 
 
 def test_a_fault_of_our_own_is_one_line_too(cli, scene_folder, tmp_path, monkeypatch):
-    import jaxmap.mapping_plan
+    import jaxmap.runs.mapping_plan
 
     def broken(*_: object) -> None:
         raise ZeroDivisionError("one\ntwo")
 
-    monkeypatch.setattr(jaxmap.mapping_plan, "plan_run", broken)
+    monkeypatch.setattr(jaxmap.runs.mapping_plan, "plan_run", broken)
     outcome = cli(*map_words(scene_folder, tmp_path / "run"))
     assert outcome.status == 1
     assert "ZeroDivisionError: one two" in outcome.error
@@ -301,12 +301,12 @@ def test_a_fault_of_our_own_is_one_line_too(cli, scene_folder, tmp_path, monkeyp
 
 
 def test_an_interrupt_is_one_line(cli, scene_folder, tmp_path, monkeypatch):
-    import jaxmap.mapping_plan
+    import jaxmap.runs.mapping_plan
 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(jaxmap.mapping_plan, "plan_run", interrupted)
+    monkeypatch.setattr(jaxmap.runs.mapping_plan, "plan_run", interrupted)
     outcome = cli(*map_words(scene_folder, tmp_path / "run"))
     assert outcome.status == 130
     assert outcome.error == "interrupted"

@@ -12,7 +12,15 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.config import (
+from jaxmap.ensemble.options import EnsembleOptions
+from jaxmap.errors import UsageError
+from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.geometry.plane import fit_plane_mlesac
+from jaxmap.host.files import config_folder
+from jaxmap.labellers.deeplab import make_deeplab_labeller
+from jaxmap.labellers.plane import make_plane_labeller
+from jaxmap.labels import ROVER_CLASSES
+from jaxmap.runs.config import (
     RULE_FIELDS,
     DeeplabConfig,
     FusionConfig,
@@ -24,14 +32,6 @@ from jaxmap.config import (
     load_config,
     split_fusion,
 )
-from jaxmap.deeplab_labeller import make_deeplab_labeller
-from jaxmap.ensemble.options import EnsembleOptions
-from jaxmap.errors import UsageError
-from jaxmap.files import config_folder
-from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.geometry.plane import fit_plane_mlesac
-from jaxmap.labellers import make_plane_labeller
-from jaxmap.labels import ROVER_CLASSES
 from jaxmap.stereo.options import StereoOptions
 
 CONFIGS = sorted(config_folder().glob("*.yaml"))

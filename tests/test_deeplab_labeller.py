@@ -17,13 +17,13 @@ from networks import NETWORK_CLASSES, small_model
 from reference_pixelwise import merged_probabilities
 from strategies import HEIGHT_PX, WIDTH_PX, disparities, rngs
 
-from jaxmap.deeplab_labeller import make_class_map, make_deeplab_labeller
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.labellers import Labeller, harden
+from jaxmap.labellers.base import Labeller, harden
+from jaxmap.labellers.deeplab import make_class_map, make_deeplab_labeller
 from jaxmap.labels import IGNORE
-from jaxmap.mapper import Mapper, MapperParams, make_mapper
-from jaxmap.segmentation import Segmenter
+from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
+from jaxmap.runs.segmentation import Segmenter
 from jaxmap.types import Frame, PointLabels, make_grid, make_stereo_camera
 
 CAMERA = make_stereo_camera(

@@ -125,7 +125,7 @@ def test_a_map_without_a_system_is_told_where_it_gets_one(cli, tmp_path):
 
 def test_the_error_map_shows_each_verdict_in_its_place(run, tmp_path):
     from jaxmap.evaluation.evaluate import ScoringOptions
-    from jaxmap.map_evaluation import TruthOptions, evaluate_run
+    from jaxmap.runs.evaluation import TruthOptions, evaluate_run
 
     evaluation, _ = evaluate_run(run, [truth_file(tmp_path)], TruthOptions(), ScoringOptions())
     colours = error_colours(evaluation)

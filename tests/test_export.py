@@ -146,7 +146,7 @@ def test_a_full_disk_keeps_the_old_file(tmp_path, monkeypatch) -> None:
     voxels, top = occupied_voxels(voxel_map, params, FusionRule()), as_numpy(top_down(voxel_map, params, FusionRule()))
     for name in ("map.ply", "bev.tif"):
         (tmp_path / name).write_text("old")
-    monkeypatch.setattr("jaxmap.files.sync", full)
+    monkeypatch.setattr("jaxmap.host.files.sync", full)
     with pytest.raises(JaxmapError, match="disk full"):
         write_ply(tmp_path / "map.ply", voxels, ROVER_CLASSES, np.zeros(3))
     with pytest.raises(JaxmapError, match="disk full"):

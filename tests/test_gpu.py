@@ -10,9 +10,9 @@ import pytest
 from fixtures import scene_folder, shared_cache  # noqa: F401
 from test_mapping_run import planned
 
-from jaxmap.mapper import StepInfo
-from jaxmap.mapping_plan import Plan
-from jaxmap.sequence import prepare_frames
+from jaxmap.mapping.sequence import prepare_frames
+from jaxmap.mapping.step import StepInfo
+from jaxmap.runs.mapping_plan import Plan
 
 SETTINGS: list[dict[str, Any]] = [
     {"labeller": "none"},

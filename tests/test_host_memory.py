@@ -9,18 +9,18 @@ import sys
 
 import pytest
 
-from jaxmap import host_memory
+from jaxmap.host import memory as host_memory
 
 ASKED = f"glibc.malloc.hugetlb=1:glibc.malloc.mmap_max=0:glibc.malloc.trim_threshold={1 << 62}:glibc.malloc.arena_max=1"
 SCRIPT = """
 import os, sys
-from jaxmap import host_memory
+from jaxmap.host import memory as host_memory
 print(os.getpid(), sys.argv[1:], os.environ.get("GLIBC_TUNABLES", "unset"), flush=True)
 host_memory.restart_with_lasting_memory()
 """
 WORK = """
 import resource
-from jaxmap import host_memory
+from jaxmap.host import memory as host_memory
 host_memory.restart_with_lasting_memory()
 import numpy as np
 faults = []
@@ -85,7 +85,7 @@ def test_memory_that_was_freed_is_not_fetched_again():
     assert int(run(WORK)) < 20
 
 
-PEAK = "from jaxmap.host_memory import peak_resident_mib; print(peak_resident_mib())"
+PEAK = "from jaxmap.host.memory import peak_resident_mib; print(peak_resident_mib())"
 
 
 def test_the_peak_is_that_of_the_program_not_of_the_one_that_started_it():

@@ -12,7 +12,9 @@ from hypothesis import given
 from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, rngs
 
 from jaxmap.errors import JaxmapError
-from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
+from jaxmap.labellers.base import Labeller, make_no_labeller
+from jaxmap.labellers.files import make_files_labeller
+from jaxmap.labellers.plane import make_plane_labeller
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, PointLabels
 

@@ -15,12 +15,12 @@ from networks import NETWORK_CLASSES, small_model, write_small_model
 from PIL import Image
 from test_mapping_run import log_odds, planned
 
-from jaxmap.cli import main
+from jaxmap.commands.main import main
 from jaxmap.datasets.images import read_image
 from jaxmap.labels import IGNORE
-from jaxmap.map_store import load_map
-from jaxmap.segmentation import Segmenter
-from jaxmap.sequence import prepare_frames
+from jaxmap.mapping.sequence import prepare_frames
+from jaxmap.mapping.store import load_map
+from jaxmap.runs.segmentation import Segmenter
 
 RENAMED = ("--deeplab.class-map", "gravel=rock", "boulder=rock")
 

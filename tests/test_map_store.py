@@ -19,10 +19,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxmap import map_store
 from jaxmap.errors import JaxmapError
-from jaxmap.files import atomic_path
-from jaxmap.map_store import MapAttributes, load_map, save_map
+from jaxmap.host.files import atomic_path
+from jaxmap.mapping import store as map_store
+from jaxmap.mapping.store import MapAttributes, load_map, save_map
 from jaxmap.types import GridSpec, VoxelMap
 
 
@@ -150,7 +150,7 @@ def test_a_real_kill_leaves_a_map(tmp_path) -> None:
     program = (
         "import sys; sys.path[:0] = sys.argv[2:]\n"
         "from test_map_store import small_map\n"
-        "from jaxmap.map_store import MapAttributes, save_map\n"
+        "from jaxmap.mapping.store import MapAttributes, save_map\n"
         "for value in range(1, 100000):\n"
         "    save_map(sys.argv[1], small_map(float(value)), MapAttributes())\n"
         "    print(value, flush=True)\n"

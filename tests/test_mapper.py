@@ -15,8 +15,10 @@ from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, disparities, poses, rngs
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import top_down
-from jaxmap.labellers import make_files_labeller, make_no_labeller, make_plane_labeller
-from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.labellers.base import make_no_labeller
+from jaxmap.labellers.files import make_files_labeller
+from jaxmap.labellers.plane import make_plane_labeller
+from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.types import Frame, PointLabels, make_grid, make_stereo_camera
 
 CAMERA = make_stereo_camera(

@@ -15,19 +15,18 @@ from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_fol
 from PIL import Image
 from scenes import BASELINE_M, BOXES_M, ROCK, SAND, frame_name, pose, scene_frame, timestamp_s, write_folder_sequence
 
-import jaxmap.mapping_grid
-from jaxmap.config import MapConfig, check_config, config_tree, load_config
+import jaxmap.runs.mapping_plan
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import stored_fusion
 from jaxmap.geometry.bounds import grid_around_views, map_bytes
-from jaxmap.map_store import load_map
-from jaxmap.mapping import run_plan
-from jaxmap.mapping_grid import DEFAULT_VOXELS_M
-from jaxmap.mapping_plan import Plan, plan_run
-from jaxmap.run_folder import RunFolder
-from jaxmap.sequence import prepare_frames
+from jaxmap.mapping.sequence import prepare_frames
+from jaxmap.mapping.store import load_map
+from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
+from jaxmap.runs.folder import RunFolder
+from jaxmap.runs.mapping import run_plan
+from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M, Plan, plan_run
 
 OUTPUTS = ("map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "config.yaml", "poses.tum", "report.html")
 
@@ -221,7 +220,7 @@ def test_no_grid_is_made_that_is_not_needed(scene_folder, monkeypatch):
         made.append(grid_around_views(*words))
         return made[-1]
 
-    monkeypatch.setattr(jaxmap.mapping_grid, "grid_around_views", counted)
+    monkeypatch.setattr(jaxmap.runs.mapping_plan, "grid_around_views", counted)
     plan = planned(scene_folder)
     assert len(made) == 1
     planned(scene_folder, grid={"max_memory_gib": map_bytes(plan.grid, 3) / 2**30 / 2})

@@ -78,8 +78,8 @@ def test_the_wheel_carries_every_config():
 
 
 def test_the_command_is_there():
-    assert PROJECT["scripts"] == {"jaxmap": "jaxmap.cli:main"}
-    tree = ast.parse((ROOT / "jaxmap" / "cli.py").read_text("utf-8"))
+    assert PROJECT["scripts"] == {"jaxmap": "jaxmap.commands.main:main"}
+    tree = ast.parse((ROOT / "jaxmap" / "commands" / "main.py").read_text("utf-8"))
     assert "main" in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 

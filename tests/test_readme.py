@@ -12,7 +12,7 @@ from PIL import Image
 import jaxmap
 from jaxmap.commands import COMMANDS
 from jaxmap.datasets import READERS
-from jaxmap.files import config_folder
+from jaxmap.host.files import config_folder
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf8")

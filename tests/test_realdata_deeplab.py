@@ -17,7 +17,7 @@ from jaxmap.datasets.samples import motorcycle_disparity
 from jaxmap.fusion.params import stored_fusion
 from jaxmap.fusion.query import voxel_labels
 from jaxmap.labels import IGNORE
-from jaxmap.map_store import load_map
+from jaxmap.mapping.store import load_map
 
 SOURCE = "deeplabv3_mnv2_voc_trainval_folded.safetensors"
 

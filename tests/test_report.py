@@ -20,7 +20,7 @@ from PIL import Image
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.labels import IGNORE, ROVER_CLASSES
-from jaxmap.map_store import MapAttributes, save_map
+from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.report import voxel_view as voxel_view_module
 from jaxmap.report.faces import exposed_faces, merge_voxels
 from jaxmap.report.html import MAX_KEY_FRAMES, write_report
@@ -324,7 +324,7 @@ def test_metrics_of_other_shapes_are_shown_kindly(run_folder) -> None:
 
 
 def test_an_interrupted_run_and_many_key_frames(run_folder) -> None:
-    from jaxmap.map_store import load_map
+    from jaxmap.mapping.store import load_map
 
     voxel_map, attributes = load_map(run_folder / "map.zarr")
     cut = MapAttributes(attributes.crs, SITE, fusion=attributes.fusion, progress={"complete": False, "next_frame": 12})

@@ -16,12 +16,12 @@ from killed import kill_when
 from scenes import write_folder_sequence
 from test_mapping_run import config_of, log_odds, metrics_of, planned
 
-from jaxmap import map_store
 from jaxmap.errors import JaxmapError
-from jaxmap.map_store import load_map
-from jaxmap.mapping import run_plan
-from jaxmap.run_folder import RunFolder
-from jaxmap.sequence import FusedFrame
+from jaxmap.mapping import store as map_store
+from jaxmap.mapping.sequence import FusedFrame
+from jaxmap.mapping.store import load_map
+from jaxmap.runs.folder import RunFolder
+from jaxmap.runs.mapping import run_plan
 
 
 class Cut(Exception):
@@ -108,14 +108,14 @@ def test_a_skipped_frame_is_counted_once_over_a_cut(cli, scene_copy, tmp_path):
 def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_path):
     # The frames are slowed down, so that the process dies in the middle of the run.
     program = (
-        "import sys, time, jaxmap.sequence, jaxmap.mapping\n"
-        "from jaxmap.cli import main\n"
-        "fuse = jaxmap.sequence.run_sequence\n"
+        "import sys, time, jaxmap.mapping.sequence, jaxmap.runs.mapping\n"
+        "from jaxmap.commands.main import main\n"
+        "fuse = jaxmap.mapping.sequence.run_sequence\n"
         "def slowly(*words, **options):\n"
         "    for result in fuse(*words, **options):\n"
         "        yield result\n"
         "        time.sleep(0.5)\n"
-        "jaxmap.mapping.run_sequence = slowly\n"
+        "jaxmap.runs.mapping.run_sequence = slowly\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
     run = tmp_path / "run"
@@ -267,13 +267,13 @@ def test_a_full_disk_leaves_the_last_checkpoint(cli, scene_folder, finished_run,
 
 @pytest.mark.parametrize("writer", ["write_exports", "write_poses"])
 def test_a_full_disk_at_the_end_leaves_a_map_to_resume(writer, cli, scene_folder, finished_run, tmp_path, monkeypatch):
-    import jaxmap.mapping
+    import jaxmap.runs.mapping
 
     def full(*_: object, **__: object) -> None:
         raise JaxmapError("disk full", where="bev.tif", fix="free some space or write to another disk")
 
     with monkeypatch.context() as patched:
-        patched.setattr(jaxmap.mapping, writer, full)
+        patched.setattr(jaxmap.runs.mapping, writer, full)
         assert cli(*map_words(scene_folder, tmp_path / "run")).status == 1
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
     same_run(tmp_path / "run", finished_run)

@@ -14,10 +14,10 @@ import yaml
 from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 
 from jaxmap.errors import JaxmapError
-from jaxmap.files import atomic_path, bundled, remove
-from jaxmap.map_store import load_map
-from jaxmap.mapping import run_plan
-from jaxmap.run_folder import RunFolder
+from jaxmap.host.files import atomic_path, bundled, remove
+from jaxmap.mapping.store import load_map
+from jaxmap.runs.folder import RunFolder
+from jaxmap.runs.mapping import run_plan
 
 
 def files(folder):

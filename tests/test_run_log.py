@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxmap.errors import JaxmapError
-from jaxmap.run_log import MOST_KEPT, RunLog, Sample
+from jaxmap.runs.log import MOST_KEPT, RunLog, Sample
 
 numbers = st.lists(st.floats(0, 1e6, allow_nan=False), max_size=60)
 

@@ -13,10 +13,10 @@ from fixtures import cli, shared_cache  # noqa: F401
 from golden.seeded_weights import seeded_image, seeded_weights
 from PIL import Image
 
-from jaxmap import segmentation
 from jaxmap.errors import JaxmapError
 from jaxmap.models.architecture import tf_architecture, torch_architecture
 from jaxmap.models.checkpoint import SavedModel, load_network, save_model
+from jaxmap.runs import segmentation as segmentation
 
 SMALL = replace(
     torch_architecture("mobilenet_v2", ("background", "sand", "rock")),

@@ -17,12 +17,12 @@ from golden.seeded_weights import exported, seeded_image, seeded_weights
 from PIL import Image
 from safetensors.numpy import save_file
 
-from jaxmap import weight_files
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
 from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import load_model, save_model
+from jaxmap.runs import weights as weight_files
 
 SMALL = replace(
     torch_architecture("mobilenet_v2", ("background", "sand", "rock")),

@@ -17,8 +17,8 @@ from test_mapping_run import planned
 
 from jaxmap.datasets.base import StereoPair
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.prefetch import prefetch
-from jaxmap.sequence import prepare_frames, run_sequence
+from jaxmap.host.prefetch import prefetch
+from jaxmap.mapping.sequence import prepare_frames, run_sequence
 
 
 def own_threads() -> list[threading.Thread]:

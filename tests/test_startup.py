@@ -19,14 +19,14 @@ from test_mapping_run import planned
 
 import jaxmap
 from jaxmap.fusion.params import make_fusion_params
+from jaxmap.mapping.sequence import frame_form, prepare_frames
 from jaxmap.models.deeplab import fold_batch_norm, initial_weights
-from jaxmap.sequence import frame_form, prepare_frames
 from jaxmap.types import make_grid, make_stereo_camera, to_device
 
 COUNTING = """
 import json, sys
 import jax
-from jaxmap.cli import main
+from jaxmap.commands.main import main
 
 misses = []
 
@@ -67,7 +67,7 @@ def test_the_listener_hears():
 
 
 def test_help_does_not_even_import_numpy():
-    program = "import sys; from jaxmap.cli import main; main(['--help']); print([m for m in HEAVY if m in sys.modules])"
+    program = "import sys; from jaxmap.commands.main import main; main(['--help']); print([m for m in HEAVY if m in sys.modules])"
     heavy = ("numpy", "jax", "tyro", "pydantic", "rich", "yaml")
     done = subprocess.run(
         [sys.executable, "-c", f"HEAVY = {heavy}; {program}"],

@@ -10,7 +10,7 @@ import rasterio
 from rasterio import Affine
 
 from jaxmap.evaluation.evaluate import ClassMap
-from jaxmap.map_store import MapAttributes, save_map
+from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.types import GridSpec, VoxelMap
 
 CLASSES = ("background", "sand", "rock")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.config import DepthConfig, MapConfig, load_config
+from jaxmap.runs.config import DepthConfig, MapConfig, load_config
 
 SAMPLE = "sample:traverse"
 TITLE = "A simulated traverse, mapped and scored"
@@ -52,11 +52,11 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(DemoArguments, "demo", words)
 
-    from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets.samples import sample_truth
-    from jaxmap.map_evaluation import summary
-    from jaxmap.output_folder import write_json
+    from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.host.output_folder import write_json
     from jaxmap.report.demo_page import write_demo_page
+    from jaxmap.runs.evaluation import summary
 
     keep_compiled_programs()
     console = Console()
@@ -77,11 +77,11 @@ def main(words: Sequence[str]) -> int:
 def _map_and_score(out: Path, config: MapConfig, truth: Path, console: Console) -> tuple[dict, dict]:
     """One row: a run and its scores, written into the run folder."""
     from jaxmap.evaluation.evaluate import ScoringOptions
-    from jaxmap.map_evaluation import TruthOptions, evaluate_run, write_evaluation
-    from jaxmap.mapping import run_plan
-    from jaxmap.mapping_plan import plan_run
     from jaxmap.report.html import write_report
-    from jaxmap.run_folder import RunFolder
+    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, write_evaluation
+    from jaxmap.runs.folder import RunFolder
+    from jaxmap.runs.mapping import run_plan
+    from jaxmap.runs.mapping_plan import plan_run
 
     folder = RunFolder(out)
     plan = plan_run(SAMPLE, config, console.tell)

@@ -11,7 +11,7 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import JaxmapError, UsageError, options_as
-from jaxmap.output_folder import check_inputs_stay
+from jaxmap.host.output_folder import check_inputs_stay
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
 
 
@@ -65,12 +65,12 @@ def main(words: Sequence[str]) -> int:
     arguments = parse(EvaluateArguments, "evaluate", words)
     _check(arguments)
 
-    from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.datasets.rock_list import SIZE_CLASSES
     from jaxmap.evaluation.evaluate import ScoringOptions
-    from jaxmap.map_evaluation import TruthOptions, evaluate_run, summary, write_evaluation
-    from jaxmap.run_folder import RunFolder
+    from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, summary, write_evaluation
+    from jaxmap.runs.folder import RunFolder
 
     keep_compiled_programs()
     console = Console()

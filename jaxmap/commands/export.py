@@ -29,9 +29,8 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(ExportArguments, "export", words)
 
-    from jaxmap.map_store import load_map
-    from jaxmap.run_folder import RunFolder
-    from jaxmap.run_outputs import EXPORTS, write_exports
+    from jaxmap.mapping.store import load_map
+    from jaxmap.runs.folder import EXPORTS, RunFolder, write_exports
 
     folder = RunFolder(arguments.run)
     voxel_map, attributes = load_map(folder.map)

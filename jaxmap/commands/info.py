@@ -25,9 +25,9 @@ def main(words: Sequence[str]) -> int:
     import zarr
 
     import jaxmap
-    from jaxmap.cache import cache_folder
     from jaxmap.datasets import READERS
-    from jaxmap.files import config_folder
+    from jaxmap.host.cache import cache_folder
+    from jaxmap.host.files import config_folder
 
     lines = {
         "jaxmap": jaxmap.__version__,

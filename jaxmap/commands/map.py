@@ -11,8 +11,8 @@ from typing import Annotated
 import tyro
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.errors import UsageError
+from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
 
 OUTPUTS = (
     *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
@@ -57,10 +57,10 @@ def main(words: Sequence[str]) -> int:
         raise UsageError(f"--checkpoint-every-s is {arguments.checkpoint_every_s}", fix="give seconds from 0 on")
 
     # JAX is imported only now: help and wrong options need not wait for it.
-    from jaxmap.cache import keep_compiled_programs
-    from jaxmap.mapping import run_plan
-    from jaxmap.mapping_plan import plan_run
-    from jaxmap.run_folder import RunFolder
+    from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.runs.folder import RunFolder
+    from jaxmap.runs.mapping import run_plan
+    from jaxmap.runs.mapping_plan import plan_run
 
     keep_compiled_programs(scopes=arguments.profile)
     # What ends a job on a cluster or a service is told like Ctrl-C: the map is saved first.

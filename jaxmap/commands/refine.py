@@ -91,12 +91,11 @@ def main(words: Sequence[str]) -> int:
     arguments = parse(RefineArguments, "refine", words)
     _check(arguments)
 
-    from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets import ReadOptions
     from jaxmap.datasets.label_coding import choose_coding
-    from jaxmap.map_evaluation import TruthOptions
-    from jaxmap.refine_folder import CALIBRATION, OUTPUTS, check_apart
-    from jaxmap.refine_run import GroundFiles, run_refine
+    from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.runs.evaluation import TruthOptions
+    from jaxmap.runs.refinement import CALIBRATION, OUTPUTS, GroundFiles, check_apart, run_refine
 
     keep_compiled_programs()
     # What ends a job is told like Ctrl-C; the best so far lies in the folder.

@@ -13,7 +13,7 @@ from jaxmap.commands.console import Console, parse
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 
 if TYPE_CHECKING:
-    from jaxmap.segmentation import Segmenter
+    from jaxmap.runs.segmentation import Segmenter
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ def main(words: Sequence[str]) -> int:
     if arguments.scores is not None and arguments.masks is None:
         raise UsageError("there is nothing to score against", where="--scores", fix="give --masks DIR")
 
-    from jaxmap.cache import keep_compiled_programs
+    from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.models.checkpoint import load_network
-    from jaxmap.segmentation import Segmenter, check_masks, check_outputs, find_images, find_masks
+    from jaxmap.runs.segmentation import Segmenter, check_masks, check_outputs, find_images, find_masks
 
     keep_compiled_programs()
     images = find_images(arguments.images)
@@ -69,7 +69,7 @@ def main(words: Sequence[str]) -> int:
 def _label(arguments: SegmentArguments, segmenter: Segmenter, images: list[Path], masks: list[Path]) -> None:
     """Labels, writes and scores all images; those that cannot be read are told at the end."""
     from jaxmap.evaluation.segmentation_scores import SegmentationScores
-    from jaxmap.segmentation import label_image, score_image, write_labelled
+    from jaxmap.runs.segmentation import label_image, score_image, write_labelled
 
     console, faults = Console(), []
     scores = SegmentationScores.empty(segmenter.classes)
@@ -98,7 +98,7 @@ def _label(arguments: SegmentArguments, segmenter: Segmenter, images: list[Path]
 
 
 def _tell_scores(console: Console, summary: dict, file: Path | None) -> None:
-    from jaxmap.output_folder import write_json
+    from jaxmap.host.output_folder import write_json
 
     console.table(_title(summary), COLUMNS, _rows(summary))
     if file is not None:

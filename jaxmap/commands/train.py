@@ -12,7 +12,7 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
-from jaxmap.training_config import TrainConfig, check_train_config, load_train_config, train_config_tree
+from jaxmap.runs.training_plan import TrainConfig, check_train_config, load_train_config, train_config_tree
 
 OUTPUTS = ("report.html", "model.safetensors", "history.csv", "metrics.json", "config.yaml", "checkpoints/")
 
@@ -50,12 +50,11 @@ def main(words: Sequence[str]) -> int:
     if arguments.resume and arguments.overwrite:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
 
-    from jaxmap.cache import keep_compiled_programs
-    from jaxmap.map_training_plan import plan_map_training
-    from jaxmap.output_folder import locked
-    from jaxmap.training_folder import TrainingFolder
-    from jaxmap.training_plan import plan_training
-    from jaxmap.training_run import TrainingRun
+    from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.host.output_folder import locked
+    from jaxmap.runs.map_training import plan_map_training
+    from jaxmap.runs.training import TrainingFolder, TrainingRun
+    from jaxmap.runs.training_plan import plan_training
 
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)

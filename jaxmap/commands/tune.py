@@ -11,9 +11,9 @@ from typing import Annotated
 import tyro
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.errors import UsageError
-from jaxmap.output_folder import check_inputs_stay
+from jaxmap.host.output_folder import check_inputs_stay
+from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
 
 
 @dataclass(frozen=True)
@@ -77,14 +77,13 @@ def main(words: Sequence[str]) -> int:
     config = check_config(config_tree(arguments.settings))
     _check(arguments, config)
 
-    from jaxmap.cache import keep_compiled_programs
     from jaxmap.datasets.label_coding import choose_coding
-    from jaxmap.map_evaluation import TruthOptions
-    from jaxmap.output_folder import locked
+    from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.host.output_folder import locked
+    from jaxmap.runs.evaluation import TruthOptions
+    from jaxmap.runs.tuning import Source, TuneOptions, TuningRun
     from jaxmap.tuning.descent import DescentOptions
     from jaxmap.tuning.map_loss import LossOptions
-    from jaxmap.tuning_plan import Source, TuneOptions
-    from jaxmap.tuning_run import TuningRun
 
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)

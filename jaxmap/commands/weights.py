@@ -76,13 +76,13 @@ def _import(arguments: ImportArguments) -> int:
 
 
 def _fetch(arguments: FetchArguments) -> int:
-    from jaxmap.weight_files import fetch
+    from jaxmap.runs.weights import fetch
 
     return _convert(fetch(arguments.name, mirror=arguments.mirror, tell=Console().tell), arguments)
 
 
 def _convert(source: Path, arguments: ImportArguments | FetchArguments) -> int:
-    from jaxmap.weight_files import convert_file
+    from jaxmap.runs.weights import convert_file
 
     imported = convert_file(source, arguments.out, classes=arguments.classes, output_stride=arguments.output_stride)
     count = sum(array.size for array in imported.weights.values())

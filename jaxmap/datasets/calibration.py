@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from jaxmap.errors import JaxmapError
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
 from jaxmap.types import StereoCamera, make_stereo_camera
 

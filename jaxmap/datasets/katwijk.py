@@ -27,7 +27,7 @@ from jaxmap.datasets.katwijk_rover import (
 from jaxmap.datasets.matlab_calibration import read_matlab_calibration
 from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import JaxmapError
-from jaxmap.files import config_folder
+from jaxmap.host.files import config_folder
 from jaxmap.localisation.estimate import RoverPoses, estimate_poses
 from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, time_to_nearest
 from jaxmap.stereo.rectify import StereoRig

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxmap.datasets.calibration import data_lines
 from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import JaxmapError
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 
 _TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_LEAST_COLUMNS = 8, 12, 8
 

@@ -17,7 +17,7 @@ from jaxmap.datasets.katwijk import open_katwijk
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.datasets.poses import make_pose_track
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.files import bundled
+from jaxmap.host.files import bundled
 from jaxmap.types import make_stereo_camera
 
 

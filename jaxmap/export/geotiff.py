@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmap.errors import JaxmapError
-from jaxmap.files import atomic_path
 from jaxmap.fusion.query import TopDown
 from jaxmap.geometry.grid import exact_corner
+from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE
 from jaxmap.types import GridSpec
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxmap.export.voxels import OccupiedVoxels
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE, class_colours
 
 _PLY_TYPES = {"f8": "double", "f4": "float", "u1": "uchar"}

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from jaxmap.errors import JaxmapError
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.models.architecture import Architecture, check_architecture
 from jaxmap.models.deeplab import Weights, weight_shapes
 from jaxmap.models.tensor_files import as_float32, read_safetensors, shortened

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from jaxmap.errors import JaxmapError
-from jaxmap.files import write_error
+from jaxmap.host.files import write_error
 from jaxmap.profiling.peaks import Peaks, measure_peaks
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program
 from jaxmap.profiling.trace import OperationTimes, read_operation_times

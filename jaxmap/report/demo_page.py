@@ -15,7 +15,7 @@ from rasterio.windows import from_bounds
 
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import occupied_voxels
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.report.html import in_3d
 from jaxmap.report.inline import inline_image

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from jaxmap.datasets.label_raster import OTHER, TARGET, UNLABELLED
 from jaxmap.evaluation.evaluate import Evaluation
 from jaxmap.evaluation.truth_cells import samples_of
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.report.plan_sheet import INK, Entries, draw_footer, lay_out, map_axes, new_figure
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.report.inline import inline_image, script_text
 from jaxmap.report.missed_section import missed_section
 from jaxmap.report.page import page

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.report.plan_sheet import (
     END,
     FAINT,

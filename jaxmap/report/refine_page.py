@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.refinement.consistency import Consistency
 from jaxmap.refinement.rounds import Refinement
 from jaxmap.report.charts import Chart, Mark, Series, line_chart

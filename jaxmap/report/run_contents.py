@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
-from jaxmap.map_store import MapAttributes, load_map
+from jaxmap.mapping.store import MapAttributes, load_map
 from jaxmap.types import VoxelMap
 
 PICTURE_KINDS = ("left", "disparity", "labels")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.simulation.mesh import BACKGROUND, ROCK, SAND, SURFACE_LABEL, Mesh
 from jaxmap.simulation.rays import RayImage, downward_rays
 from jaxmap.simulation.render import FirstHits

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.simulation.camera_rig import GPS_ANTENNA_BODY_M
 from jaxmap.simulation.drive import WHEEL_BASE_M, WHEEL_TRACK_M, Drive
 

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from jaxmap.datasets.images import read_image
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.files import atomic_path
+from jaxmap.host.files import atomic_path
 from jaxmap.stereo.rectify import StereoRig
 
 

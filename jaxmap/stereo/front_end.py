@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
-from jaxmap.stages import timed_stage
 from jaxmap.stereo.match import Matcher
 from jaxmap.stereo.options import StereoOptions
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from jaxmap.host.prefetch import prefetch
 from jaxmap.labels import IGNORE
-from jaxmap.prefetch import prefetch
 from jaxmap.training.data import Example, read_example
 from jaxmap.training.masks import MaskLookup
 from jaxmap.training.options import TrainingOptions

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 
 from jaxmap.errors import JaxmapError
-from jaxmap.files import write_error
+from jaxmap.host.files import write_error
 from jaxmap.training.step import TrainState
 
 KEPT = 2

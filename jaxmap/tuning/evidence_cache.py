@@ -26,8 +26,8 @@ from jaxmap.fusion.params import FusionParams, FusionRule
 from jaxmap.fusion.sensor_model import frame_evidence, range_weight
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import flat_voxel_index, view_window, whole_window, window_shape
-from jaxmap.labellers import Labeller, TunableLabels, fixed_labels, harden
-from jaxmap.mapper import MapperParams
+from jaxmap.labellers.base import Labeller, TunableLabels, fixed_labels, harden
+from jaxmap.mapping.step import MapperParams
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
 
 BLOCK_PX = 4

@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
 from jaxmap.fusion.params import FusionParams, FusionRule
-from jaxmap.labellers import make_files_labeller
+from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labels import IGNORE
-from jaxmap.mapper import MapperParams, make_mapper
+from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.deeplab import Weights, training_form

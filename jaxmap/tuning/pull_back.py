@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxmap.errors import JaxmapError
-from jaxmap.mapper import Mapper, MapperParams
+from jaxmap.mapping.step import Mapper, MapperParams
 from jaxmap.types import Frame, VoxelMap
 
 MapLoss = Callable[[VoxelMap, MapperParams], Float[Array, ""]]

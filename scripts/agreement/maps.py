@@ -16,7 +16,7 @@ from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.query import observed, occupied
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import exact_corner
-from jaxmap.mapper import Mapper, MapperParams
+from jaxmap.mapping.step import Mapper, MapperParams
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2

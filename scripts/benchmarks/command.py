@@ -11,8 +11,8 @@ from typing import Any
 
 from benchmarks.gate import merged, verdicts
 from benchmarks.groups import Group, all_groups
-from jaxmap.files import atomic_path
-from jaxmap.output_folder import write_json
+from jaxmap.host.files import atomic_path
+from jaxmap.host.output_folder import write_json
 
 
 def run(arguments: argparse.Namespace, baseline_path: Path) -> int:

@@ -24,7 +24,6 @@ from safetensors.numpy import save_file
 
 from benchmarks.scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_poses
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
 from jaxmap.fusion.params import FusionRule, make_fusion_params
@@ -32,12 +31,14 @@ from jaxmap.fusion.view import Reach, view_of
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.geometry.plane import fit_plane_mlesac
-from jaxmap.labellers import Labeller, make_no_labeller, make_plane_labeller
+from jaxmap.labellers.base import Labeller, make_no_labeller
+from jaxmap.labellers.deeplab import make_deeplab_labeller
+from jaxmap.labellers.plane import make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
-from jaxmap.mapper import Mapper, MapperParams, compile_step, make_mapper
+from jaxmap.mapping.sequence import prepare_frames, run_sequence
+from jaxmap.mapping.step import Mapper, MapperParams, compile_step, make_mapper
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.importers import import_weights
-from jaxmap.sequence import prepare_frames, run_sequence
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions
 from jaxmap.types import Frame, GridSpec, PointLabels, VoxelMap, make_voxel_map

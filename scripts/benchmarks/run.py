@@ -16,7 +16,7 @@ from benchmarks.groups import Group, case_name
 from benchmarks.harness import measure
 from benchmarks.threads import usable_cores
 from benchmarks.wording import case_lines
-from jaxmap.host_memory import peak_resident_mib
+from jaxmap.host.memory import peak_resident_mib
 
 LIBRARIES = (
     *("jax", "numpy", "opencv-python-headless", "scikit-image"),

@@ -19,7 +19,7 @@ from jaxmap.datasets.pose_files import read_poses, write_tum
 from jaxmap.datasets.poses import poses_at
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.pose_scores import pose_errors
-from jaxmap.files import config_folder
+from jaxmap.host.files import config_folder
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 
 T_BODY_LOCCAM = np.eye(4)

@@ -16,7 +16,7 @@ from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.matlab_calibration import read_matlab_calibration
 from jaxmap.datasets.matlab_objects import structs_of_objects
 from jaxmap.errors import JaxmapError
-from jaxmap.files import config_folder
+from jaxmap.host.files import config_folder
 from jaxmap.stereo.rectify import make_rectifier
 
 SIZE_PX = (640, 480)

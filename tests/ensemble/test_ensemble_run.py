@@ -13,10 +13,10 @@ from scenes import ROCK, SAND
 from test_mapping_run import config_of, log_odds, metrics_of, planned
 
 from jaxmap.errors import JaxmapError
-from jaxmap.map_store import load_map
-from jaxmap.mapping import run_plan
-from jaxmap.run_folder import RunFolder
-from jaxmap.sequence import FusedFrame
+from jaxmap.mapping.sequence import FusedFrame
+from jaxmap.mapping.store import load_map
+from jaxmap.runs.folder import RunFolder
+from jaxmap.runs.mapping import run_plan
 
 MEMBERS = 3
 ENSEMBLE = ("--ensemble.members", str(MEMBERS))
@@ -28,7 +28,7 @@ class Cut(Exception):
 
 @pytest.fixture(scope="module")
 def run(scene_folder: Path, tmp_path_factory) -> Path:
-    from jaxmap.cli import main
+    from jaxmap.commands.main import main
 
     out = tmp_path_factory.mktemp("ensemble") / "run"
     assert main(map_words(scene_folder, out, *ENSEMBLE)) == 0

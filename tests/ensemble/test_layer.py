@@ -16,7 +16,7 @@ from jaxmap.ensemble.layer import ensemble_layers, layer_names, named_layers, st
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import top_down
-from jaxmap.map_store import MEMBERS, MapAttributes, load_map, save_map
+from jaxmap.mapping.store import MEMBERS, MapAttributes, load_map, save_map
 from jaxmap.types import GridSpec, VoxelMap
 
 PARAMS = make_fusion_params(CLASSES, occupancy_threshold=0.6, class_threshold=0.7)

@@ -20,8 +20,9 @@ from jaxmap.ensemble.members import doubted
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.labellers import make_files_labeller, make_no_labeller
-from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.labellers.base import make_no_labeller
+from jaxmap.labellers.files import make_files_labeller
+from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.types import Frame, PointLabels, VoxelMap, make_grid, make_stereo_camera
 
 CAMERA = make_stereo_camera(

@@ -12,12 +12,12 @@ from jax.profiler import ProfileData
 from test_mapping_run import planned
 
 from jaxmap.errors import JaxmapError
-from jaxmap.mapper import compile_step
+from jaxmap.mapping.sequence import prepare_frames
+from jaxmap.mapping.step import compile_step
 from jaxmap.profiling.peaks import Peaks
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program
 from jaxmap.profiling.step_profile import StepProfile, stage_table, table_lines
 from jaxmap.profiling.trace import read_operation_times
-from jaxmap.sequence import prepare_frames
 
 
 def event_names(folder: Path) -> set[str]:

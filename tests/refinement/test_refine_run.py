@@ -19,11 +19,11 @@ from scenes import BOXES_M, CAMERA, pose, timestamp_s
 from scipy.spatial.transform import Rotation
 from tune_faults import labels_from_above, write_truth
 
-import jaxmap.refine_run
+import jaxmap.runs.refinement
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.calibration import read_camera_yaml, read_mounting, write_camera_yaml
 from jaxmap.datasets.pose_files import read_poses, write_tum
-from jaxmap.output_folder import locked
+from jaxmap.host.output_folder import locked
 from jaxmap.stereo.rectify import make_rectifier, make_stereo_rig
 
 FRAMES = 4
@@ -58,7 +58,7 @@ def wrong(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def refined(wrong, scene_folder, tmp_path_factory) -> Path:
     """The scene with wrong poses, refined upon its elevation model."""
-    from jaxmap.cli import main
+    from jaxmap.commands.main import main
 
     out = tmp_path_factory.mktemp("refined") / "out"
     dem = write_dem(out.parent / "dem.tif")
@@ -258,7 +258,7 @@ def test_two_runs_do_not_share_a_folder(cli, scene_folder, tmp_path):
 
 
 def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(jaxmap.refine_run, "read_inputs", lambda *_: pytest.fail("it reads first"))
+    monkeypatch.setattr(jaxmap.runs.refinement, "read_inputs", lambda *_: pytest.fail("it reads first"))
     (tmp_path / "file").write_text("")
     status, error = fault(cli, scene_folder, tmp_path / "file", "--stop", 2)
     assert (status, "cannot be made: it is a file" in error) == (1, True)

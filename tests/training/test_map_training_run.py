@@ -74,7 +74,7 @@ def words(place: Path, out: Path, *more: object) -> list[object]:
 @pytest.fixture(scope="module")
 def finished(place, tmp_path_factory) -> Path:
     """The folder of an uninterrupted run; only to be read."""
-    from jaxmap.cli import main
+    from jaxmap.commands.main import main
 
     out = tmp_path_factory.mktemp("map_run") / "run"
     assert main([str(word) for word in words(place, out)]) == 0
@@ -106,7 +106,7 @@ def test_a_run_writes_what_a_run_on_images_writes(finished, place):
 
 
 def test_an_interrupted_run_goes_on_exactly(cli, finished, place, tmp_path, monkeypatch):
-    from jaxmap.training_run import TrainingRun
+    from jaxmap.runs.training import TrainingRun
 
     def cut(self, epoch, state, meter):
         kept(self, epoch, state, meter)
@@ -125,7 +125,7 @@ def test_an_interrupted_run_goes_on_exactly(cli, finished, place, tmp_path, monk
 
 SLOWLY = """\
 import sys, time
-from jaxmap.training_log import Meter
+from jaxmap.runs.training import Meter
 from tiny_training import main, tiny_network
 
 add = Meter.add
@@ -151,8 +151,8 @@ def test_a_killed_process_is_gone_on_with(cli, finished, place, tmp_path):
 
 
 def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(place):
-    from jaxmap.map_training_plan import plan_map_training
-    from jaxmap.training_config import load_train_config
+    from jaxmap.runs.map_training import plan_map_training
+    from jaxmap.runs.training_plan import load_train_config
 
     config = replace(load_train_config(str(place / "map.yaml")), ground_truth=place / "truth.tif")
     plan = plan_map_training(str(place / "sequence"), config, place / "first.safetensors", tell=lambda line: None)

@@ -11,7 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxmap.errors import UsageError
-from jaxmap.settings import config_folder
+from jaxmap.host.settings import config_folder
+from jaxmap.runs.training_plan import (
+    DataConfig,
+    MapTruthConfig,
+    TrainConfig,
+    check_train_config,
+    load_train_config,
+    train_config_tree,
+)
 from jaxmap.training.batches import Order
 from jaxmap.training.options import (
     AugmentationOptions,
@@ -20,14 +28,6 @@ from jaxmap.training.options import (
     NormOptions,
     OptimiserOptions,
     TrainingOptions,
-)
-from jaxmap.training_config import (
-    DataConfig,
-    MapTruthConfig,
-    TrainConfig,
-    check_train_config,
-    load_train_config,
-    train_config_tree,
 )
 
 CONFIGS = sorted((config_folder() / "train").glob("*.yaml"))

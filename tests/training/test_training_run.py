@@ -32,12 +32,10 @@ from training_data import CLASSES, change_mask, scene, write_pair
 
 from jaxmap.errors import JaxmapError
 from jaxmap.models.checkpoint import load_network
+from jaxmap.runs.training import TrainingFolder, TrainingRun
+from jaxmap.runs.training_plan import TrainingPlan, load_train_config, plan_training
 from jaxmap.training.checkpoints import Checkpoints
 from jaxmap.training.step import StepInfo, TrainState
-from jaxmap.training_config import load_train_config
-from jaxmap.training_folder import TrainingFolder
-from jaxmap.training_plan import TrainingPlan, plan_training
-from jaxmap.training_run import TrainingRun
 
 OUTPUTS = {"model.safetensors", "history.csv", "metrics.json", "config.yaml", "report.html", "checkpoints"}
 TIMES = ("seconds", "images_per_s")
@@ -196,7 +194,7 @@ def test_a_run_may_be_cut_again_and_again(plan, whole_run, tmp_path):
 
 SLOWLY = """
 import sys, time
-from jaxmap.training_log import Meter
+from jaxmap.runs.training import Meter
 from tiny_training import main, tiny_network
 
 add = Meter.add

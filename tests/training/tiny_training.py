@@ -18,7 +18,7 @@ from flax import nnx
 from jaxtyping import Array
 from training_data import CLASSES, write_data
 
-from jaxmap.cli import main
+from jaxmap.commands.main import main
 from jaxmap.models import deeplab
 from jaxmap.models.architecture import Architecture, torch_architecture
 from jaxmap.models.layers import ConvBlock

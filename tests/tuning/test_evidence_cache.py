@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 from networks import small_model
 from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, disparities
 
-from jaxmap.deeplab_labeller import make_deeplab_labeller
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.labellers import Labeller, make_files_labeller, make_no_labeller, make_plane_labeller
-from jaxmap.mapper import MapperParams, make_mapper
+from jaxmap.labellers.base import Labeller, make_no_labeller
+from jaxmap.labellers.deeplab import make_deeplab_labeller
+from jaxmap.labellers.files import make_files_labeller
+from jaxmap.labellers.plane import make_plane_labeller
+from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.tuning.evidence_cache import (
     CacheRecipe,
     EvidenceCache,

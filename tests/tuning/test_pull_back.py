@@ -18,9 +18,10 @@ from small_scenes import small_camera
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import FusionRule, make_fusion_params
 from jaxmap.fusion.query import class_probabilities, top_down
-from jaxmap.labellers import make_files_labeller, make_plane_labeller
+from jaxmap.labellers.files import make_files_labeller
+from jaxmap.labellers.plane import make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
-from jaxmap.mapper import Mapper, MapperParams, make_mapper
+from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.tuning.pull_back import make_pull_back, map_gradient
 from jaxmap.types import Frame, VoxelMap, make_grid
 

@@ -15,14 +15,14 @@ from html_tables import tables_of
 from killed import SLOW_DISK, fill_disk, kill_when
 from tune_faults import tune_words, write_truth
 
-import jaxmap.output_folder
-import jaxmap.tuning_run
-from jaxmap.config import load_config
+import jaxmap.host.output_folder
+import jaxmap.runs.tuning
 from jaxmap.errors import JaxmapError
-from jaxmap.map_store import load_map
-from jaxmap.output_folder import locked
+from jaxmap.host.output_folder import locked
+from jaxmap.mapping.store import load_map
+from jaxmap.runs.config import load_config
+from jaxmap.runs.tuning import descent_notes
 from jaxmap.tuning.descent import Losses, Step
-from jaxmap.tuning_run import descent_notes
 
 SHORT = ("--steps", "6", "--held-out-share", "0.4")
 
@@ -86,7 +86,7 @@ def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
 
 
 def test_what_was_best_is_on_disk_when_it_breaks(cli, scene_folder, truth, tmp_path, monkeypatch):
-    real, out = jaxmap.tuning_run.descend, tmp_path / "fusion.yaml"
+    real, out = jaxmap.runs.tuning.descend, tmp_path / "fusion.yaml"
 
     def breaking(loss, start, options, *, data, moves, on_step):
         def stop_later(step):
@@ -96,7 +96,7 @@ def test_what_was_best_is_on_disk_when_it_breaks(cli, scene_folder, truth, tmp_p
 
         return real(loss, start, options, data=data, moves=moves, on_step=stop_later)
 
-    monkeypatch.setattr(jaxmap.tuning_run, "descend", breaking)
+    monkeypatch.setattr(jaxmap.runs.tuning, "descend", breaking)
     outcome = cli(*tune_words(scene_folder, truth, out, *SHORT))
     assert outcome.status == 1
     assert "the loss diverges" in outcome.error
@@ -120,7 +120,7 @@ def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder
         on_step(Step(0, Losses(1.0, 1.0), start, best=True))
         raise JaxmapError("the loss diverges", where="tuning", fix="take a lower --learning-rate")
 
-    monkeypatch.setattr(jaxmap.tuning_run, "descend", breaking)
+    monkeypatch.setattr(jaxmap.runs.tuning, "descend", breaking)
     assert cli(*tune_words(scene_folder, truth, out, *SHORT, "--overwrite")).status == 1
     assert load_config(str(out)).fusion.class_increments is not None
     assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
@@ -162,11 +162,11 @@ def test_what_cannot_be_written_is_told_before_the_work(cli, scene_folder, truth
     def refused(**_):
         raise PermissionError(errno.EACCES, "refused")
 
-    monkeypatch.setattr(jaxmap.tuning_run.TuningRun, "cache", lambda *_: pytest.fail("it reads first"))
+    monkeypatch.setattr(jaxmap.runs.tuning.TuningRun, "cache", lambda *_: pytest.fail("it reads first"))
     (tmp_path / "fusion.html").mkdir()
     outcome = cli(*tune_words(scene_folder, truth, tmp_path / "fusion.yaml", *SHORT, "--overwrite"))
     assert (outcome.status, "it is a folder" in outcome.error) == (2, True)
-    monkeypatch.setattr(jaxmap.output_folder, "TemporaryFile", refused)
+    monkeypatch.setattr(jaxmap.host.output_folder, "TemporaryFile", refused)
     outcome = cli(*tune_words(scene_folder, truth, tmp_path / "new" / "fusion.yaml", *SHORT))
     assert (outcome.status, "no permission to write" in outcome.error) == (1, True)
     assert not (tmp_path / "new").exists(), "nothing is left of it"

@@ -1,0 +1,85 @@
+"""The command line: finds the command, runs it, and turns errors into one line and an exit status."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from jaxmap import __version__
+from jaxmap.commands import COMMANDS
+from jaxmap.errors import JaxmapError
+from jaxmap.host.memory import restart_with_lasting_memory
+
+LASTING_MEMORY = ("train", "tune", "segment", "map", "demo")
+"""Commands that take and give back the memory of a network at every step: gigabytes in training, hundreds of MiB where
+images are labelled, a sixth of whose time it took to fetch them anew."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs `jaxmap COMMAND ...`.
+
+    Returns:
+        0; 2 for a wrong command line or configuration; 1 for anything else; 130 when interrupted.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if words else 2
+    if words[0] in ("-V", "--version"):
+        print(f"jaxmap {__version__}")
+        return 0
+    if words[0] not in COMMANDS:
+        _say(f"error: there is no command {words[0]!r}; choose one of {', '.join(COMMANDS)}")
+        return 2
+    if arguments is None and words[0] in LASTING_MEMORY:
+        restart_with_lasting_memory()
+    try:
+        command = importlib.import_module(f"jaxmap.commands.{words[0]}")
+        return command.main(words[1:]) or 0
+    except JaxmapError as error:
+        if debug:
+            raise
+        _say(f"error: {error}")
+        return error.exit_code
+    except KeyboardInterrupt:
+        _say("error: interrupted")
+        return 130
+    except BrokenPipeError:
+        # The reader of our output has gone; Python must not complain about it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if debug:
+            raise
+        what = " ".join(str(error).split())[:300] or "no message"
+        _say(f"error: {type(error).__name__}: {what}; this is a fault of jaxmap: --debug shows where")
+        return 1
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: jaxmap COMMAND [OPTIONS]",
+            "",
+            "Stereo images and rover poses in, a georeferenced 3D semantic voxel map out.",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "jaxmap COMMAND --help says more; --debug shows the traceback of an error.",
+        ]
+    )
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

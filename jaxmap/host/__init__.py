@@ -1,0 +1,1 @@
+"""Files, threads, caches and memory of the host."""

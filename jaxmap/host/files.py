@@ -1,0 +1,113 @@
+"""Where bundled files lie, and writing so that a crash or a full disk leaves either the old content or the new."""
+
+from __future__ import annotations
+
+import errno
+import glob
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from jaxmap.errors import JaxmapError
+
+_PACKAGE = Path(__file__).parents[1]
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+def config_folder() -> Path:
+    """The folder of configurations that come with jaxmap."""
+    packaged = _PACKAGE / "configs"
+    return packaged if packaged.is_dir() else _PACKAGE.parent / "configs"
+
+
+def bundled(name: str) -> Path:
+    """A file or folder of data that comes with jaxmap.
+
+    Raises:
+        JaxmapError: it is not there.
+    """
+    path = _PACKAGE / "bundled" / name
+    if not path.exists():
+        raise JaxmapError(f"{name} is missing", where=path.parent, fix="install jaxmap anew")
+    return path
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path`, which replaces it when the block ends well.
+
+    The temporary file keeps the suffix, so that writers which go by it still do. Missing parent
+    folders are made. When the block raises, the temporary file is removed and `path` stays as it was.
+
+    Raises:
+        JaxmapError: the operating system refused (disk full, no permission, ...).
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.stem}.tmp-{os.getpid()}{target.suffix}")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_strays(target)
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, target)
+        sync(target.parent)
+    except OSError as error:
+        raise write_error(error, target) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _remove_strays(target: Path) -> None:
+    """Removes what processes that were killed while writing the same file have left."""
+    for stray in target.parent.glob(f".{glob.escape(target.stem)}.tmp-*{glob.escape(target.suffix)}"):
+        process = stray.name.removeprefix(f".{target.stem}.tmp-").removesuffix(target.suffix)
+        if process.isdecimal() and not _is_alive(int(process)):
+            stray.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def sync(path: Path) -> None:
+    """Waits until a file, or the entries of a folder, have reached the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        # Some file systems cannot sync a folder; that is no reason to fail.
+        if error.errno != errno.EINVAL:
+            raise
+    finally:
+        os.close(handle)
+
+
+def remove(path: Path) -> None:
+    """Removes a file, if it is there.
+
+    Raises:
+        JaxmapError: the operating system refused.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise write_error(error, path) from error
+
+
+def write_error(error: OSError, where: object) -> JaxmapError:
+    """What went wrong while writing `where`, as an error that says what to do."""
+    if error.errno in _FULL:
+        return JaxmapError("disk full", where=where, fix="free some space or write to another disk")
+    if error.errno in _REFUSED:
+        return JaxmapError("no permission to write", where=where, fix="check its owner or write somewhere else")
+    reason = error.strerror or str(error) or type(error).__name__
+    return JaxmapError(f"writing failed ({reason})", where=where, fix="check the path and the disk")

@@ -1,0 +1,120 @@
+"""The folder a run writes: kept from other runs, with the settings it was begun with."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.host.files import atomic_path, write_error
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps other runs out of a folder, which is made where it is missing.
+
+    A folder that was made for a run which then wrote nothing is removed again.
+
+    Raises:
+        JaxmapError: another run is writing into it, or it cannot be made or written.
+    """
+    made = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # The folder itself is locked, so that no lock file is left behind.
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        reason = "it is a file" if folder.is_file() else error.strerror
+        raise JaxmapError(f"cannot be made: {reason}", where=folder, fix="choose another --out") from error
+    try:
+        _lock(handle, folder)
+        _check_writable(folder)
+        yield
+    finally:
+        if made:
+            # Refused by the system where something lies in it.
+            with suppress(OSError):
+                folder.rmdir()
+        os.close(handle)
+
+
+def _lock(handle: int, folder: Path) -> None:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise JaxmapError(
+            "another run is writing here", where=folder, fix="wait for it, or choose another --out"
+        ) from error
+
+
+def _check_writable(folder: Path) -> None:
+    """Tells before the work what would be told only after it."""
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise write_error(error, folder) from error
+
+
+def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
+    """Refuses to write over what is read.
+
+    Raises:
+        UsageError: an output lies where an input does.
+    """
+    read = {path.resolve() for path in inputs if path is not None}
+    for path in outputs:
+        if path.resolve() in read:
+            raise UsageError("an input would be overwritten", where=path, fix="choose another --out")
+
+
+def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
+    """Compares the settings that a run was begun with to those of now.
+
+    Raises:
+        JaxmapError: the file cannot be read.
+        UsageError: settings differ; all of them are named.
+    """
+    import yaml
+
+    try:
+        before = yaml.safe_load(path.read_text(encoding="utf8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise JaxmapError(f"cannot be read: {error}", where=path, fix="start anew with --overwrite") from error
+    before = before if isinstance(before, dict) else {}
+    before, tree = _dotted(before), _dotted(tree)
+    differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))
+    if differing:
+        raise UsageError(
+            f"the run was begun with another {', '.join(differing)}",
+            where=path,
+            fix="resume with the same settings, or start anew with --overwrite",
+        )
+
+
+def _dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A tree of settings as one level, with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def write_yaml(path: Path, tree: dict[str, Any]) -> None:
+    """Writes plain values as YAML, atomically."""
+    import yaml
+
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf8")
+
+
+def write_json(path: Path, tree: Any) -> None:
+    """Writes plain values as JSON, atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf8")

@@ -1,0 +1,83 @@
+"""Settings of a command: a frozen dataclass, read strictly from YAML files and plain values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from jaxmap.errors import UsageError
+from jaxmap.host.files import config_folder
+
+Config = TypeVar("Config")
+
+
+class Settings(Generic[Config]):
+    """Reads the settings of one command.
+
+    Args:
+        kind: their dataclass.
+        command: its name.
+        folder: where its configurations lie below `config_folder`.
+        given: keys that a run writes into its resolved configuration and the command line names.
+    """
+
+    def __init__(self, kind: type[Config], command: str, *, folder: str = ".", given: tuple[str, ...] = ()) -> None:
+        self._adapter: TypeAdapter[Config] = TypeAdapter(kind)
+        self._command, self._given = command, given
+        self._folder = config_folder() / folder
+
+    def load(self, name_or_path: str) -> Config:
+        """Reads a YAML file, or the one of that name which comes with jaxmap.
+
+        Raises:
+            UsageError: no such file, not YAML, an unknown key, or a value out of range.
+        """
+        import yaml
+
+        path = Path(name_or_path)
+        if not path.exists():
+            path = self._folder / (name_or_path if name_or_path.endswith(".yaml") else f"{name_or_path}.yaml")
+        if not path.is_file():
+            known = ", ".join(sorted(file.stem for file in self._folder.glob("*.yaml")))
+            raise UsageError(f"no config {name_or_path!r}", fix=f"give a YAML file or one of: {known}")
+        try:
+            tree = yaml.safe_load(path.read_text(encoding="utf8"))
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise UsageError(f"not YAML: {error}", where=path, fix="correct the file") from error
+        except OSError as error:
+            raise UsageError(f"cannot be read: {error.strerror}", where=path) from error
+        if not isinstance(tree or {}, dict):
+            raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
+        return self.check({key: value for key, value in (tree or {}).items() if key not in self._given}, where=path)
+
+    def check(self, tree: dict[str, Any], where: object = "the command line") -> Config:
+        """Builds the settings from plain values, strictly.
+
+        Raises:
+            UsageError: names every unknown key and every value out of range.
+        """
+        try:
+            return self._adapter.validate_python(tree)
+        except ValidationError as error:
+            complaints = "; ".join(_complaints(error))
+            raise UsageError(complaints, where=where, fix=f"see jaxmap {self._command} --help") from error
+
+    def tree(self, config: Config) -> dict[str, Any]:
+        """Settings as plain values, for YAML and JSON."""
+        return self._adapter.dump_python(config, mode="json")
+
+
+def _complaints(error: ValidationError) -> list[str]:
+    """One clause for each fault, by its dotted key."""
+    clauses: dict[str, str] = {}
+    for fault in error.errors():
+        # Branches of a union appear in the location; they are not part of the key.
+        key = ".".join(str(part) for part in fault["loc"] if isinstance(part, int) or part.isidentifier())
+        if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+            clauses[key] = f"unknown key {key}"
+        else:
+            value = repr(fault["input"])
+            clauses.setdefault(key, f"{key} is {value[:60]}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
+    return list(clauses.values())

@@ -1,0 +1,1 @@
+"""What gives each point of a frame its class; all labellers have one signature."""

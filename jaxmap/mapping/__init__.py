@@ -1,0 +1,1 @@
+"""The compiled step, what feeds it frames, and the map on disk."""

@@ -1,0 +1,202 @@
+"""Running a sequence: frames are read and matched ahead in threads while the step computes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Float, PRNGKeyArray
+
+from jaxmap.datasets.base import FrameRef, StereoSequence
+from jaxmap.datasets.images import as_rgb
+from jaxmap.datasets.label_files import LabelFolder
+from jaxmap.errors import FrameError
+from jaxmap.host.prefetch import prefetch
+from jaxmap.host.stages import timed_stage
+from jaxmap.labellers.base import Labeller, Needs
+from jaxmap.mapping.step import Mapper, MapperParams, StepCost, StepInfo, compile_step
+from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
+from jaxmap.types import Frame, StereoCamera, VoxelMap, to_device
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame on its way to the step: ready, or with the reason why it is not.
+
+    `stages_s` holds what each host stage took.
+    """
+
+    index: int
+    ref: FrameRef
+    frame: Frame | None = None
+    rectified: RectifiedFrame | None = None
+    fault: FrameError | None = None
+    stages_s: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FusedFrame:
+    """What became of one frame.
+
+    `info` is None where it was skipped; `cost` is that of compiling the step, with the first frame.
+    """
+
+    prepared: PreparedFrame
+    info: StepInfo | None = None
+    cost: StepCost | None = None
+
+
+def prepare_frames(
+    sequence: StereoSequence,
+    front_end: StereoFrontEnd,
+    label_folder: LabelFolder | None = None,
+    *,
+    needs: Needs | None = None,
+    pose_errors: Float[np.ndarray, "N M 6"] | None = None,
+    first: int = 0,
+    workers: int = 2,
+    ahead: int = 4,
+) -> Iterator[PreparedFrame]:
+    """Reads, rectifies and matches the frames of a sequence ahead of their use; the first are begun at once.
+
+    Args:
+        sequence: the frames and their poses.
+        front_end: rectification and matching.
+        label_folder: where each frame's labels lie, for the `files` labeller.
+        needs: what the labeller asks of each frame (`Labeller.needs`); the rectified left image is delivered,
+            as RGB, where it is `image`.
+        pose_errors: of the members of an ensemble, for each frame.
+        first: index of the first frame.
+        workers: threads.
+        ahead: frames in the making or waiting, which bounds the memory.
+
+    Raises:
+        JaxmapError: the first readable pair has left and right swapped.
+    """
+    T_world_camera = sequence.T_world_camera @ front_end.T_raw_rectified
+
+    def prepare(index: int) -> PreparedFrame:
+        ref = sequence.frames[index]
+        try:
+            stages_s: dict[str, float] = {}
+            with timed_stage("read", stages_s):
+                pair = sequence.read_pair(ref)
+            rectified = front_end(pair.left, pair.right)
+            stages_s |= {"rectify": rectified.rectify_s, "match": rectified.match_s}
+            filled: dict[str, Any] = {}
+            if needs == "image":
+                # All as RGB: a grey image between coloured ones must not change the form of a frame.
+                filled["image"] = to_device(as_rgb(rectified.left))
+            if label_folder is not None:
+                with timed_stage("labels", stages_s):
+                    filled |= label_folder.read(ref, front_end)
+            if pose_errors is not None:
+                filled["pose_errors"] = to_device(pose_errors[index], np.float32)
+            pose = jaxlie.SE3.from_matrix(to_device(T_world_camera[index], np.float32))
+            frame = Frame(to_device(rectified.disparity_px), pose, **filled)
+        except FrameError as fault:
+            return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
+        return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)
+
+    return _in_right_order(prefetch(prepare, range(first, len(sequence.frames)), workers, ahead), front_end)
+
+
+def _in_right_order(frames: Iterator[PreparedFrame], front_end: StereoFrontEnd) -> Iterator[PreparedFrame]:
+    """The same frames, the first readable one checked for swapped images."""
+    order_checked = False
+    for prepared in frames:
+        if prepared.rectified is not None and not order_checked:
+            front_end.check_order(prepared.rectified, f"frame {prepared.ref.name}")
+            order_checked = True
+        yield prepared
+
+
+def frame_form(camera: StereoCamera, labeller: Labeller, members: int = 0) -> Frame:
+    """The form of the frames that `prepare_frames` makes for a labeller: shapes without numbers.
+
+    Args:
+        camera: the rectified camera.
+        labeller: what asks for images, labels or probabilities.
+        members: of an ensemble.
+    """
+    size = (camera.height_px, camera.width_px)
+    kinds: dict[Needs, tuple[tuple[int, ...], DTypeLike]] = {
+        "image": ((*size, 3), np.uint8),
+        "labels": (size, np.uint8),
+        "class_probabilities": ((*size, len(labeller.classes)), np.float32),
+    }
+
+    def frame() -> Frame:
+        filled: dict[str, Any] = {} if labeller.needs is None else {labeller.needs: jnp.zeros(*kinds[labeller.needs])}
+        pose_errors = jnp.zeros((members, 6), np.float32) if members else None
+        return Frame(jnp.zeros(size, np.float32), jaxlie.SE3.identity(), pose_errors=pose_errors, **filled)
+
+    return jax.eval_shape(frame)
+
+
+def run_sequence(
+    mapper: Mapper,
+    voxel_map: VoxelMap,
+    frames: Iterable[PreparedFrame],
+    params: MapperParams,
+    key: PRNGKeyArray,
+    *,
+    strict: bool = False,
+    form: Frame | None = None,
+) -> Iterator[tuple[VoxelMap, FusedFrame]]:
+    """Fuses prepared frames one after the other.
+
+    Args:
+        mapper: its step.
+        voxel_map: where to begin.
+        frames: of `prepare_frames`.
+        params: the numbers of the step.
+        key: that of the run.
+        strict: stop at a frame that cannot be used.
+        form: that of the frames (`frame_form`): the step is compiled for it while the first ones are read. Without it,
+            the first frame that is ready compiles the step.
+
+    Yields:
+        After each frame, the map so far and what became of the frame. The map is donated to the
+        next frame: copy what shall last.
+
+    Raises:
+        FrameError: a frame cannot be used and `strict` is set; otherwise it is skipped.
+    """
+    cost = news = None
+    if form is not None:
+        mapper, cost = compile_step(mapper, voxel_map, form, params, key)
+        news = cost
+    for prepared in _timed(frames):
+        if prepared.frame is None:
+            if strict and prepared.fault is not None:
+                raise prepared.fault
+            yield voxel_map, FusedFrame(prepared)
+            continue
+        if cost is None:
+            mapper, cost = compile_step(mapper, voxel_map, prepared.frame, params, key)
+            news = cost
+        with timed_stage("step", prepared.stages_s):
+            voxel_map, info = mapper.step(voxel_map, prepared.frame, params, key)
+            jax.block_until_ready(voxel_map.log_odds)
+        yield voxel_map, FusedFrame(prepared, info, news)
+        news = None
+
+
+def _timed(frames: Iterable[PreparedFrame]) -> Iterator[PreparedFrame]:
+    """The same frames; how long each was waited for is one of its stages."""
+    source = iter(frames)
+    while True:
+        waited_s: dict[str, float] = {}
+        with timed_stage("wait", waited_s):
+            prepared = next(source, None)
+        if prepared is None:
+            return
+        prepared.stages_s.update(waited_s)
+        yield prepared

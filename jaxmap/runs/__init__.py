@@ -1,0 +1,1 @@
+"""What the commands do with files: plans, run folders, logs and outputs."""

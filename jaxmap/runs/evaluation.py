@@ -1,0 +1,228 @@
+"""`jaxmap evaluate`, from files to files: a run and its ground truth in, scores and an error map out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float64
+
+import jaxmap
+from jaxmap.datasets.crs import Extent, crs_text, read_crs
+from jaxmap.datasets.label_coding import DEFAULT_CODING, LabelCoding
+from jaxmap.datasets.label_raster import LabelRaster
+from jaxmap.datasets.orthomosaic import read_label_orthomosaic, read_picture
+from jaxmap.datasets.pose_files import read_poses
+from jaxmap.datasets.rock_list import DEFAULT_DIAMETERS_M, draw_rocks, find_rock_lists, read_rock_lists
+from jaxmap.ensemble.layer import stored_layers
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.evaluation.evaluate import ClassMap, Evaluation, ScoringOptions, evaluate_map
+from jaxmap.evaluation.truth_cells import PixelCorners, pixel_corners, sample_between
+from jaxmap.evaluation.views import Views
+from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
+from jaxmap.fusion.query import top_down
+from jaxmap.host.output_folder import write_json
+from jaxmap.mapping.store import load_map
+from jaxmap.report.error_map import write_error_map
+from jaxmap.runs.folder import RunFolder
+from jaxmap.types import VoxelMap
+
+_MARGIN_M, _MARGIN_SHARE = 3.0, 0.05
+_BACKDROP_SAMPLES = 8
+
+
+@dataclass(frozen=True)
+class TruthOptions:
+    """How the ground truth is read.
+
+    Attributes:
+        target: the class of the map, and of the truth, that is scored.
+        coding: what the values of an orthomosaic mean.
+        crs: the system of the truth, in place of its own.
+        diameters_m: of rocks in lists that give none, by size class.
+    """
+
+    target: str = "rock"
+    coding: LabelCoding = DEFAULT_CODING
+    crs: str | None = None
+    diameters_m: Mapping[str, float] | None = None
+
+
+def read_class_map(run: Path, target: str) -> ClassMap:
+    """The map of a run as `target` is scored in it.
+
+    Raises:
+        JaxmapError: there is no map, or it is damaged.
+        UsageError: it has no such class.
+    """
+    folder = RunFolder(run)
+    if not run.is_dir():
+        raise JaxmapError("no such run folder", where=run, fix="give a folder that `jaxmap map` wrote")
+    voxel_map, attributes = load_map(folder.map)
+    if target not in voxel_map.classes:
+        known = f"its classes are {' '.join(voxel_map.classes)}" if voxel_map.classes else "it has no class at all"
+        raise UsageError(f"the map has no class {target!r}: {known}", where=folder.map, fix="name one with --class")
+    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
+    class_map = class_map_of(
+        voxel_map, params, rule, target, site_origin=np.asarray(attributes.site_origin, np.float64), crs=attributes.crs
+    )
+    ensemble = stored_layers(attributes.layers, target, folder.map)
+    return class_map if ensemble is None else replace(class_map, ensemble=np.asarray(ensemble.probability))
+
+
+def class_map_of(
+    voxel_map: VoxelMap,
+    params: FusionParams,
+    rule: FusionRule,
+    target: str,
+    *,
+    site_origin: Float64[np.ndarray, "3"],
+    crs: str | None,
+) -> ClassMap:
+    """A map from above, as `target`, one of its classes, is scored in it.
+
+    Args:
+        voxel_map: the map.
+        params: how its evidence is read, with `rule`.
+        rule: see `params`.
+        target: name of the class.
+        site_origin: where the origin of the map's world lies in `crs`, metres.
+        crs: coordinate reference system of the site, or None.
+    """
+    top = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
+    index = voxel_map.classes.index(target)
+    return ClassMap(
+        grid=voxel_map.grid,
+        is_class=(top.label == index) & top.observed,
+        probability=top.probability[index],
+        observed=top.observed,
+        height_m=top.height_m,
+        prior=float(jax.nn.sigmoid(params.class_prior[index])),
+        site_origin=site_origin,
+        crs=crs,
+    )
+
+
+def read_views(run: Path, site_origin: np.ndarray) -> tuple[Views | None, str]:
+    """The cameras of a run from its poses.tum and metrics.json; None, and why, where they cannot be read.
+
+    The poses are those of the images as they were stored: where jaxmap has rectified them, the view is off by the
+    rectifying turn, fractions of a degree for a usual rig.
+    """
+    folder = RunFolder(run)
+    try:
+        track = read_poses(folder.poses)
+        metrics = json.loads(folder.metrics.read_text(encoding="utf-8"))
+        camera, depth_range_m = metrics["camera"], metrics["grid"]["depth_range_m"]
+        T_world_camera = track.T.copy()
+        T_world_camera[:, :3, 3] -= site_origin
+        numbers = {name: float(camera[f"{name}_px"]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+        views = Views(
+            T_world_camera,
+            (numbers["fx"], numbers["fy"]),
+            (numbers["cx"], numbers["cy"]),
+            (int(numbers["width"]), int(numbers["height"])),
+            float(depth_range_m[1]),
+        )
+    except (JaxmapError, OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        reason = error if isinstance(error, JaxmapError) else f"{folder.metrics.name} cannot be read"
+        return (
+            None,
+            f"the cameras' view is not known ({reason}): every labelled cell of the map counts as in view",
+        )
+    return views, ""
+
+
+def read_truth(sources: Sequence[Path], place: Extent, options: TruthOptions) -> LabelRaster:
+    """Reads ground truth: one labelled orthomosaic, or lists of rocks (files, or a folder of them).
+
+    Raises:
+        JaxmapError: nothing there, what the readers refuse, or kinds that do not go together.
+    """
+    lists = [path for source in sources for path in find_rock_lists(source)]
+    rasters = [source for source in sources if not source.is_dir() and source not in lists]
+    if lists and not rasters:
+        rocks = read_rock_lists(lists, options.diameters_m or DEFAULT_DIAMETERS_M)
+        return draw_rocks(rocks, place, options.crs, ", ".join(path.name for path in lists))
+    if len(rasters) != 1 or lists:
+        where = ", ".join(str(source) for source in sources)
+        raise UsageError(
+            "no ground truth" if not lists and not rasters else "several ground truths",
+            where=where,
+            fix="give one labelled orthomosaic, or lists of rocks (x y [diameter], .txt or .csv)",
+        )
+    if options.crs is not None:
+        read_crs(options.crs, "--truth-crs")
+    margin = _MARGIN_M + _MARGIN_SHARE * max(place.east - place.west, place.north - place.south)
+    return read_label_orthomosaic(
+        rasters[0], place, coding=options.coding, target=options.target, crs=options.crs, margin=margin
+    )
+
+
+def evaluate_run(
+    run: Path, sources: Sequence[Path], truth_options: TruthOptions, options: ScoringOptions
+) -> tuple[Evaluation, ClassMap]:
+    """Scores the map of a run; `scores` tells all that they rest on.
+
+    Raises:
+        JaxmapError: map or truth cannot be read, or do not lie over each other.
+    """
+    class_map = read_class_map(run, truth_options.target)
+    views, remark = read_views(run, class_map.site_origin)
+    if views is None and options.max_range_m is not None:
+        raise JaxmapError(
+            f"--max-range-m needs poses.tum and metrics.json of the run: {remark}", where=run, fix="map again"
+        )
+    raster = read_truth(sources, class_map.place, truth_options)
+    evaluation = evaluate_map(class_map, raster, views, options)
+    evaluation.scores.update(
+        {
+            "class": truth_options.target,
+            "run": str(run),
+            "ground_truth": [str(source) for source in sources],
+            "crs": crs_text(class_map.crs or raster.crs) if class_map.crs or raster.crs else None,
+            "notes": [*raster.notes, *([remark] if remark else [])],
+            "jaxmap_version": jaxmap.__version__,
+        }
+    )
+    return evaluation, class_map
+
+
+def write_evaluation(
+    out: Path, picture: Path, evaluation: Evaluation, class_map: ClassMap, backdrop: Path | None
+) -> None:
+    """Writes the scores as JSON and the error map as PNG.
+
+    Raises:
+        JaxmapError: the backdrop cannot be read, or writing failed.
+    """
+    image = None
+    if backdrop is not None:
+        image = _backdrop(backdrop, evaluation, class_map)
+    write_error_map(picture, evaluation, image)
+    write_json(out, evaluation.scores)
+
+
+def _backdrop(path: Path, evaluation: Evaluation, class_map: ClassMap) -> np.ndarray:
+    """An orthomosaic on the cells of the evaluation: uint8 (I n, J n, 3), moved as the truth was."""
+    pixels, T_crs_pixel, crs = read_picture(path, class_map.place)
+    corners: PixelCorners = pixel_corners(
+        T_crs_pixel, crs, evaluation.cells, class_map.site_origin, class_map.crs, evaluation.alignment
+    )
+    return sample_between(pixels, corners, _BACKDROP_SAMPLES)
+
+
+def summary(scores: dict[str, Any]) -> str:
+    """One line on what scores rest on."""
+    frames = "" if scores["frames"] is None else f"{scores['frames']} frames, "
+    within = "" if scores["max_range_m"] is None else f" within {scores['max_range_m']:g} m"
+    return (
+        f"{frames}{scores['cells']:,} cells of {scores['cell_size_m']:g} m observed and labelled{within}, "
+        f"{scores['rock_cells']:,} of them {scores['class']}; {scores['rocks']['count']} rocks in view, "
+        f"{scores['rocks']['missed']} missed"
+    )

@@ -1,0 +1,237 @@
+"""What a run writes beside its map: pictures, PLY, GeoTIFF, poses."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxmap.datasets.pose_files import read_poses, write_tum
+from jaxmap.ensemble.layer import stored_layers
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.export.geotiff import write_geotiff
+from jaxmap.export.ply import write_ply
+from jaxmap.export.voxels import occupied_voxels
+from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
+from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
+from jaxmap.host.files import atomic_path
+from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
+from jaxmap.mapping.store import MapAttributes, holds_map, load_map
+from jaxmap.report.missed_plan import missed_picture
+from jaxmap.report.pictures import colourise_disparity, overlay_labels, top_down_picture
+from jaxmap.runs.config import MapConfig, config_tree
+from jaxmap.runs.log import RunLog
+from jaxmap.runs.mapping_plan import Plan
+from jaxmap.stereo.front_end import RectifiedFrame
+from jaxmap.types import VoxelMap
+
+_PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.png")
+
+
+class RunFolder:
+    """Paths and bookkeeping of one run folder."""
+
+    def __init__(self, path: Path) -> None:
+        """Names the files; nothing is read or written yet."""
+        self.path = path
+        self.map = path / "map.zarr"
+        self.ply = path / "map.ply"
+        self.geotiff = path / "bev.tif"
+        self.picture = path / "bev.png"
+        self.missed = path / "missed.png"
+        self.metrics = path / "metrics.json"
+        self.config = path / "config.yaml"
+        self.poses = path / "poses.tum"
+        self.scores = path / "scores.json"
+        self.errors = path / "errors.png"
+        self.pictures = path / "pictures"
+        self.profile = path / "profile"
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Keeps other runs out of the folder, see `output_folder.locked`."""
+        return locked(self.path)
+
+    def begin(self, plan: Plan, config: MapConfig, *, resume: bool, overwrite: bool) -> None:
+        """Writes the resolved configuration, or checks that a run can go on.
+
+        Raises:
+            JaxmapError: the folder holds a run already, or files of the same names that are no run's.
+            UsageError: the run to be resumed had other settings.
+        """
+        tree = {"sequence": plan.source, **config_tree(config), **plan.resolved}
+        # A run that has failed before its first save has left nothing to lose.
+        used = holds_map(self.map) or self.metrics.exists()
+        if used and resume:
+            check_same_settings(self.config, tree)
+            return
+        if used and not overwrite:
+            raise JaxmapError(
+                "the folder holds a run already",
+                where=self.path,
+                fix="go on with it (--resume), replace it (--overwrite), or choose another folder",
+            )
+        self._clear()
+        write_yaml(self.config, tree)
+
+    @property
+    def _files(self) -> tuple[Path, ...]:
+        report = self.path / "report.html"
+        # Scores are of the map that is there: they go with it.
+        scored = (self.scores, self.errors)
+        derived = (self.ply, self.geotiff, self.picture, self.missed)
+        return (*derived, self.metrics, self.poses, report, self.config, *scored)
+
+    def check_apart(self, plan: Plan, config: MapConfig) -> None:
+        """Refuses to write where the inputs lie; to be called before anything is made.
+
+        Raises:
+            UsageError: the folder is the sequence's own, or an output would overwrite an input.
+        """
+        here = self.path.resolve()
+        images = {frame.left.parent.resolve() for frame in plan.sequence.frames}
+        images |= {frame.right.parent.resolve() for frame in plan.sequence.frames}
+        if here == Path(plan.source).resolve() or any(here == folder or folder in here.parents for folder in images):
+            raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
+        check_inputs_stay(self._files, (config.poses, config.calibration, config.model))
+
+    def _is_run(self) -> bool:
+        """Whether what lies here was written by a run."""
+        if holds_map(self.map):
+            return True
+        try:
+            return self.config.read_text(encoding="utf8").startswith("sequence:")
+        except (OSError, UnicodeDecodeError):
+            return False
+
+    def resume_point(self) -> tuple[VoxelMap, RunLog] | None:
+        """The map and log that an interrupted run has saved, or None where it has saved none.
+
+        Raises:
+            JaxmapError: there is a map, but it cannot be read.
+        """
+        if not holds_map(self.map):
+            return None
+        voxel_map, attributes = load_map(self.map, members=True)
+        return voxel_map, RunLog.from_json(attributes.progress, self.map)
+
+    def _clear(self) -> None:
+        """Removes what an earlier run has written, and nothing else."""
+        if not self._is_run():
+            foreign = [file.name for file in self._files if file.exists()]
+            if foreign:
+                raise JaxmapError(
+                    f"{', '.join(foreign)} would be replaced, but no run has written them",
+                    where=self.path,
+                    fix="choose another --out",
+                )
+            return
+        for folder in (self.map, self.profile):
+            shutil.rmtree(folder, ignore_errors=True)
+        for file in self._files:
+            file.unlink(missing_ok=True)
+        for picture in self.pictures.glob("*.png"):
+            if _PICTURE_NAME.fullmatch(picture.name):
+                picture.unlink()
+
+
+def write_poses(
+    folder: RunFolder,
+    timestamps_s: Float[np.ndarray, "N"],
+    T_world_camera: Float[np.ndarray, "N 4 4"],
+    site_origin: Float[np.ndarray, "3"],
+) -> None:
+    """Writes the poses of the fused frames, absolute (site origin added), in the z-up world."""
+    absolute = np.array(T_world_camera, np.float64)
+    absolute[:, :3, 3] += site_origin
+    write_tum(folder.poses, timestamps_s, absolute)
+
+
+def write_key_frame(
+    folder: RunFolder, index: int, rectified: RectifiedFrame, labels: np.ndarray | None, classes: tuple[str, ...]
+) -> None:
+    """Writes the pictures of one frame: left image, disparity and, where there are any, labels."""
+    pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
+    if labels is not None:
+        pictures["labels"] = overlay_labels(rectified.left, labels, classes)
+    for kind, picture in pictures.items():
+        _write_image(folder, f"{index:06d}_{kind}.png", picture)
+
+
+EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.png"}
+"""The file that each form of a map goes into."""
+
+
+def write_exports(
+    folder: RunFolder, voxel_map: VoxelMap, attributes: MapAttributes, formats: Sequence[str] = tuple(EXPORTS)
+) -> list[str]:
+    """Writes the map in other forms, and returns the names of the files.
+
+    The pictures show the path of poses.tum, where there is one. Of a map with an ensemble there is another picture,
+    of what it may have missed.
+    """
+    written = [EXPORTS[name] for name in EXPORTS if name in formats]
+    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
+    if "ply" in formats:
+        write_ply(folder.ply, occupied_voxels(voxel_map, params, rule), voxel_map.classes, attributes.site_origin)
+    top: TopDown = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
+    if "geotiff" in formats:
+        where = (attributes.crs, attributes.site_origin)
+        write_geotiff(folder.geotiff, top, voxel_map.grid, voxel_map.classes, *where, layers=attributes.layers)
+    if "png" in formats:
+        path_world = None
+        if folder.poses.exists():
+            path_world = read_poses(folder.poses).T[:, :3, 3] - attributes.site_origin
+        grid, placed = voxel_map.grid, attributes.crs is not None
+        top_down_picture(top, grid, voxel_map.classes, path_world, folder.picture, georeferenced=placed)
+        target = rule.target(voxel_map.classes)
+        ensemble = stored_layers(attributes.layers, target, folder.map)
+        if ensemble is not None and target is not None:
+            missed_picture(ensemble, target, top, grid, path_world, folder.missed, georeferenced=placed)
+            written.append(folder.missed.name)
+    return written
+
+
+def count_voxels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> dict[str, Any]:
+    """How many voxels were observed, are occupied or free, and have each class."""
+    seen, solid = observed(voxel_map), occupied(voxel_map, params)
+    labels = np.bincount(np.asarray(voxel_labels(voxel_map, params, rule)).ravel(), minlength=256)
+    return {
+        "observed": int(seen.sum()),
+        "occupied": int(solid.sum()),
+        "free": int((seen & ~solid).sum()),
+        "by_class": {name: int(labels[index]) for index, name in enumerate(voxel_map.classes)},
+    }
+
+
+def count_missed(rule: FusionRule, attributes: MapAttributes, voxel_map: VoxelMap) -> dict[str, Any]:
+    """What the ensemble expects the map to have missed; nothing where there is no ensemble."""
+    target = rule.target(voxel_map.classes)
+    layers = stored_layers(attributes.layers, target, "map")
+    if layers is None or voxel_map.members is None:
+        return {}
+    missed = np.asarray(layers.missed, np.float64)
+    column_m2 = float(np.prod(np.asarray(voxel_map.grid.voxel_size_m, np.float64)[:2]))
+    return {
+        "ensemble": {
+            "class": target,
+            "members": len(voxel_map.members),
+            "missed_area_expected_m2": round(float(np.nansum(missed)) * column_m2, 4),
+            "called_area_m2": round(int(layers.called().sum()) * column_m2, 4),
+            "observed_area_m2": round(int(np.isfinite(missed).sum()) * column_m2, 4),
+            "greatest_missed_probability": round(float(np.nanmax(missed, initial=0.0)), 4),
+        }
+    }
+
+
+def _write_image(folder: RunFolder, name: str, picture: np.ndarray) -> None:
+    from PIL import Image
+
+    with atomic_path(folder.pictures / name) as temporary:
+        Image.fromarray(picture).save(temporary)

@@ -1,0 +1,467 @@
+"""A training run by map supervision, decided in full before the first step: `jaxmap train --supervision map`."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxmap.datasets.crs import Extent, read_crs
+from jaxmap.datasets.label_coding import choose_coding
+from jaxmap.datasets.label_raster import LabelRaster
+from jaxmap.datasets.orthomosaic import read_label_orthomosaic
+from jaxmap.errors import JaxmapError, UsageError, options_as, with_options
+from jaxmap.evaluation.cells import CellGrid
+from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
+from jaxmap.geometry.camera import disparity_to_points, transform_points
+from jaxmap.geometry.grid import exact_corner
+from jaxmap.host.files import bundled
+from jaxmap.host.prefetch import prefetch
+from jaxmap.labellers.deeplab import DeeplabParams
+from jaxmap.labels import IGNORE
+from jaxmap.mapping.sequence import prepare_frames
+from jaxmap.mapping.step import MapperParams
+from jaxmap.models.architecture import Architecture
+from jaxmap.models.checkpoint import SavedModel, load_network
+from jaxmap.models.deeplab import Weights, fold_batch_norm
+from jaxmap.runs.evaluation import class_map_of
+from jaxmap.runs.mapping_plan import Plan, Tell, plan_run
+from jaxmap.runs.segmentation import Segmenter
+from jaxmap.runs.training_plan import TaughtMapping, TrainConfig, TrainingPlan, check_scale, option_here, told_start
+from jaxmap.training.batches import BATCHES_AHEAD, Order
+from jaxmap.training.losses import class_weights
+from jaxmap.training.starts import make_start
+from jaxmap.training.validation import SHOWN as MOST_SHOWN
+from jaxmap.training.validation import Shown, Validation
+from jaxmap.tuning.frame_crops import FrameBatch
+from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth
+from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
+from jaxmap.types import Frame, VoxelMap
+
+
+class KeptFrame(NamedTuple):
+    """A frame as the step takes it, what its pixels are held to, and the class of the cell that each pixel lies in."""
+
+    name: str
+    frame: Frame
+    anchors: UInt8[np.ndarray, "H W"]
+    cells: UInt8[np.ndarray, "H W"]
+
+
+class CellTruth(NamedTuple):
+    """An orthomosaic over the cells of a map.
+
+    Attributes:
+        rasters: by the index of each class that it shows.
+        cells: their grid.
+        labels: the class of each cell, `IGNORE` where there is none.
+    """
+
+    rasters: Mapping[int, LabelRaster]
+    cells: CellGrid
+    labels: UInt8[np.ndarray, "I J"]
+
+    def of_points(self, points_world: Float[np.ndarray, "*s 3"]) -> UInt8[np.ndarray, "*s"]:
+        """The class of the cells that points lie in, world; `IGNORE` where there is none."""
+        rows, columns = (
+            np.floor((points_world[..., axis] - self.cells.origin_m[axis]) / self.cells.size_m) for axis in (0, 1)
+        )
+        # Tested on floats: a NaN cast to an integer would be a valid index.
+        inside = (rows >= 0) & (rows < self.cells.shape[0]) & (columns >= 0) & (columns < self.cells.shape[1])
+        at = np.where(inside, rows, 0).astype(np.int64), np.where(inside, columns, 0).astype(np.int64)
+        return np.where(inside, self.labels[at], np.uint8(IGNORE))
+
+
+@dataclass(frozen=True)
+class MapData:
+    """A sequence and its orthomosaic, as `TrainingData`.
+
+    Attributes:
+        plan: how the sequence is mapped.
+        truth: the orthomosaic.
+        train: frames that are learnt from.
+        validation: frames that are held out, from the end of the sequence.
+        truth_name: of the orthomosaic, for the page.
+    """
+
+    plan: Plan
+    truth: CellTruth
+    train: tuple[KeptFrame, ...]
+    validation: tuple[KeptFrame, ...]
+    truth_name: str
+
+    @property
+    def source(self) -> str:
+        """The sequence."""
+        return self.plan.source
+
+    @property
+    def title(self) -> str:
+        """The sequence's name."""
+        return self.plan.sequence.name
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the frames that are learnt from."""
+        return tuple(kept.name for kept in self.train)
+
+    def batches(self, order: Order, first_step: int) -> Iterator[FrameBatch]:
+        """The batches of a run from a step on."""
+        return prefetch(
+            lambda step: self._batch(order.draws(step)), range(first_step, order.steps), workers=1, ahead=BATCHES_AHEAD
+        )
+
+    def _batch(self, draws: np.ndarray) -> FrameBatch:
+        chosen = [self.train[place] for place in draws[:, 1]]
+        frames = [kept.frame for kept in chosen]
+        return FrameBatch(
+            np.stack([np.asarray(frame.image) for frame in frames]),  # type: ignore[arg-type]
+            np.stack([np.asarray(frame.disparity_px) for frame in frames]),  # type: ignore[arg-type]
+            np.stack([np.asarray(frame.T_world_camera.wxyz_xyz) for frame in frames]),  # type: ignore[arg-type]
+            np.stack([kept.anchors for kept in chosen]),  # type: ignore[arg-type]
+            draws,  # type: ignore[arg-type]
+        )
+
+    def validator(self, architecture: Architecture) -> MapValidator | None:
+        """Scores the map of the held-out frames; None where there are none."""
+        return MapValidator(self, architecture) if self.validation else None
+
+    def digest(self) -> str:
+        """A fingerprint of frames, poses, camera, bounds and truth."""
+        grid = self.plan.grid
+        text = hashlib.sha256(self.plan.digest(len(self.plan.sequence.frames)).encode())
+        text.update(repr((self.names, grid.shape, np.asarray(grid.origin_m).tolist())).encode())
+        text.update(self.truth.labels.tobytes())
+        return text.hexdigest()
+
+    def counts(self) -> dict[str, Any]:
+        """Frames, and pixels in cells of each class."""
+        classes = self.plan.labeller.classes
+        parts = {"train": self.train, "validation": self.validation}
+        pixels = {part: class_pixels(frames, len(classes)) for part, frames in parts.items()}
+        return {
+            "images": {part: len(frames) for part, frames in parts.items()},
+            "class_pixels": {
+                classes[index]: {part: int(counted[index]) for part, counted in pixels.items()}
+                for index in sorted(self.truth.rasters)
+            },
+        }
+
+    def facts(self) -> dict[str, str]:
+        """Frames and truth."""
+        return {
+            "Frames mapped": str(len(self.train)),
+            "Validation frames": str(len(self.validation)),
+            "Supervision": f"{self.truth_name}, cells of {self.truth.cells.size_m:g} m; no image is labelled",
+        }
+
+
+def class_pixels(frames: tuple[KeptFrame, ...], count: int) -> np.ndarray:
+    """Pixels that lie in cells of each class."""
+    counted = np.zeros(count, np.int64)
+    for kept in frames:
+        counted += np.bincount(kept.cells[kept.cells != IGNORE], minlength=count)
+    return counted
+
+
+class MapValidator:
+    """Scores weights by the map that they make of the held-out frames.
+
+    Args:
+        data: the frames and the truth.
+        architecture: of the network.
+    """
+
+    def __init__(self, data: MapData, architecture: Architecture) -> None:
+        self._data = data
+        # Two jitted functions: inside one, XLA would fold the batch norms anew for every frame.
+        self._fold = jax.jit(lambda weights: fold_batch_norm(architecture, weights)[1])
+
+    def score(self, weights: Weights) -> Validation:
+        """Scores weights.
+
+        Raises:
+            JaxmapError: the network's answer is not finite.
+        """
+        data, plan = self._data, self._data.plan
+        labelling = plan.params.labeller
+        assert isinstance(labelling, DeeplabParams)
+        labelling = labelling._replace(weights=self._fold(weights))
+        params = MapperParams(plan.params.camera, plan.params.fusion, labelling)
+        voxel_map, shown = plan.mapper.init(), []
+        for number, kept in enumerate(data.validation):
+            if number < MOST_SHOWN:
+                said = np.asarray(plan.mapper.label_image(kept.frame, params, plan.key, number))
+                shown.append(Shown(kept.name, np.asarray(kept.frame.image), kept.cells, said))
+            voxel_map, _ = plan.mapper.step(voxel_map, kept.frame, params, plan.key)
+        if not np.isfinite(np.asarray(voxel_map.log_odds)).all():
+            raise JaxmapError(
+                "the map of the validation frames is not finite",
+                where=plan.sequence.name,
+                fix="take a lower optimiser.learning-rate and start anew",
+            )
+        return self._scored(voxel_map, tuple(shown))
+
+    def _scored(self, voxel_map: VoxelMap, shown: tuple[Shown, ...]) -> Validation:
+        data, plan = self._data, self._data.plan
+        options = ScoringOptions(cell_size_m=data.truth.cells.size_m)
+        classes: dict[str, dict[str, Any]] = {}
+        for index, raster in data.truth.rasters.items():
+            name = plan.labeller.classes[index]
+            class_map = class_map_of(
+                voxel_map,
+                plan.params.fusion,
+                plan.rule,
+                name,
+                site_origin=plan.sequence.site_origin,
+                crs=plan.sequence.crs,
+            )
+            classes[name] = evaluate_map(class_map, raster, None, options).scores
+        ious = [scores["iou"] for scores in classes.values() if scores["iou"] is not None]
+        summary = {
+            "classes": {
+                name: {key: scores[key] for key in ("iou", "precision", "recall")}
+                | {"pixels": scores["tp"] + scores["fn"]}
+                for name, scores in classes.items()
+            },
+            "mean_iou": float(np.mean(ious)) if ious else None,
+            "accuracy": float(np.mean([scores["accuracy"] for scores in classes.values()])),
+            "images": len(data.validation),
+            "pixels": max(scores["cells"] for scores in classes.values()),
+            "unit": "cell",
+        }
+        return Validation(summary, float(np.mean([scores["nll"] for scores in classes.values()])), shown)
+
+
+MAX_FRAME_BYTES = 4 * 2**30
+"""All frames are held in memory."""
+
+_OF_THE_NETWORK = ("labeller", "model", "model_sha256", "labels", "labels_are", "classes")
+"""Settings of a mapping that say what labels; here that is the network which is trained."""
+
+
+def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, tell: Tell) -> TrainingPlan:
+    """Reads the sequence and the orthomosaic, prepares all frames once, and builds network and step.
+
+    Args:
+        source: the folder of one sequence, or `sample:NAME`.
+        config: the settings.
+        init: the network to start from; the bundled one by default.
+        tell: takes lines for the user.
+
+    Raises:
+        JaxmapError: sequence, orthomosaic, settings and network do not serve.
+    """
+    _check(config)
+    assert config.ground_truth is not None
+    path = init or bundled("rover.safetensors")
+    saved = load_network(path)
+    start = make_start(config.network, config.norm, config.classes, saved, seed=config.seed, where=path)
+    if start.fresh or start.batch_norms:
+        what = f"{', '.join(start.fresh)} would be random" if start.fresh else "batch norm would learn"
+        raise UsageError(
+            f"map supervision teaches a network that knows the classes already: {what}",
+            where=path,
+            fix="train it on images first, and leave --classes, network and norm as they are there",
+        )
+    mapping = replace(config.mapping, model=path, classes=config.classes)
+    with options_as(option_here):
+        plan = plan_run(source, mapping, lambda line: tell(with_options(line, option_here)))
+        truth, truths = read_cells(plan, config)
+        frames = keep_frames(plan, truth, saved, config.map_truth.anchor, tell)
+    train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
+    data = MapData(plan, truth, train, validation, config.ground_truth.name)
+    counts = class_pixels(train, len(config.classes))
+    _check_shown(counts, data, config)
+    tell(_told(data, counts))
+    tell(told_start(start))
+    order = Order.of(len(train), config)
+    site = Site(
+        camera=plan.front_end.camera,
+        grid=plan.grid,
+        depth_range_m=plan.depth_range_m,
+        params=plan.params.fusion,
+        rule=plan.rule,
+        truths=truths,
+        losses=_losses(config, counts, truths),
+        anchor=config.map_truth.anchor,
+        temperature=config.map_truth.temperature,
+    )
+    trainer = make_map_trainer(start.architecture, config, site, steps=order.steps)
+    return TrainingPlan(config, data, start, path, order, trainer)
+
+
+def _check(config: TrainConfig) -> None:
+    """Refuses settings that mean nothing here."""
+    if config.ground_truth is None:
+        raise UsageError("map supervision needs an orthomosaic", fix="give --ground-truth F.tif")
+    check_scale(config)
+    losses = config.loss
+    if losses.lovasz or losses.label_smoothing:
+        raise UsageError(
+            "loss.lovasz and loss.label_smoothing are of pixels", where="--supervision map", fix="leave them out"
+        )
+    if not (losses.cross_entropy or losses.soft_iou):
+        raise UsageError("every loss has a weight of 0", where="loss", fix="give one of them a weight")
+    if config.augmentation.copies is not None:
+        raise UsageError("augmentation.copies is for images", where="--supervision map", fix="leave it out")
+    if jax.local_device_count() > 1:
+        raise UsageError("map supervision runs on one device", fix="hide the others (CUDA_VISIBLE_DEVICES=0)")
+    plain = TaughtMapping()
+    if named := [name for name in _OF_THE_NETWORK if getattr(config.mapping, name) != getattr(plain, name)]:
+        raise UsageError(
+            f"mapping.{named[0]} says nothing here: the network that is trained labels",
+            where="--supervision map",
+            fix="name the network with --init and its classes with --classes",
+        )
+    if config.mapping.ensemble.members:
+        raise UsageError(
+            "mapping.ensemble.members says nothing here: the network learns from one map",
+            where="--supervision map",
+            fix="leave it out",
+        )
+
+
+def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, MapTruth]]:
+    """The orthomosaic over the map: as rasters and cells, and as arrays of the loss, for each class it shows.
+
+    Raises:
+        JaxmapError: it cannot be read, or does not lie over the map.
+        UsageError: it shows fewer than two classes of the network.
+    """
+    options, path = config.map_truth, config.ground_truth
+    assert path is not None
+    coding = choose_coding(options.remap or (), None, "map_truth.remap")
+    named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
+    shown = [index for index, name in enumerate(config.classes) if name in named]
+    if len(shown) < 2:
+        raise UsageError(
+            f"the ground truth shows fewer than two classes of the network ({' '.join(config.classes)}): "
+            f"{coding.text()}",
+            where=path,
+            fix="say what its values mean: --map-truth.remap 0=unlabelled 1=sand 2=rock",
+        )
+    if options.crs is not None:
+        read_crs(options.crs, "map_truth.crs")
+    place, rasters, truths, labels, cells = _place(plan), {}, {}, None, None
+    for index in shown:
+        raster = read_label_orthomosaic(path, place, coding=coding, target=config.classes[index], crs=options.crs)
+        rasters[index] = raster
+        truths[index], found, cells = make_map_truth(
+            plan.grid, raster, plan.sequence.site_origin, plan.sequence.crs, cell_size_m=options.cell_size_m
+        )
+        labels = np.full(found.labelled.shape, IGNORE, np.uint8) if labels is None else labels
+        labels[found.truly()] = index
+    assert labels is not None and cells is not None
+    return CellTruth(rasters, cells, labels), truths
+
+
+def _place(plan: Plan) -> Extent:
+    """The extent of the map in its coordinate reference system."""
+    origin_m, voxel_m = exact_corner(plan.grid)
+    low = plan.sequence.site_origin[:2] + origin_m[:2]
+    high = low + voxel_m[:2] * plan.grid.shape[:2]
+    return Extent(float(low[0]), float(low[1]), float(high[0]), float(high[1]), plan.sequence.crs)
+
+
+def keep_frames(plan: Plan, truth: CellTruth, first: SavedModel, anchor: float, tell: Tell) -> tuple[KeptFrame, ...]:
+    """All frames that can be used, prepared; the others are told.
+
+    Raises:
+        JaxmapError: they take too much memory.
+    """
+    camera = plan.front_end.camera
+    needed = len(plan.sequence.frames) * camera.width_px * camera.height_px * (3 + 4 + 1 + 1)
+    if needed > MAX_FRAME_BYTES:
+        raise JaxmapError(
+            f"{len(plan.sequence.frames)} frames would take {needed / 2**30:.1f} GiB of memory",
+            where=plan.sequence.name,
+            fix="take fewer: --mapping.stride, --mapping.stop",
+        )
+    hidden = [index for index in range(len(plan.labeller.classes)) if index not in truth.rasters]
+    teacher = Segmenter(first) if hidden and anchor > 0 else None
+    kept = []
+    for prepared in prepare_frames(plan.sequence, plan.front_end, needs="image"):
+        if prepared.frame is None or prepared.rectified is None:
+            tell(f"skipped: {prepared.fault}")
+            continue
+        anchors = np.full(prepared.frame.disparity_px.shape, IGNORE, np.uint8)
+        if teacher is not None:
+            said = teacher.logits(prepared.rectified.left).argmax(axis=-1)
+            anchors = np.where(np.isin(said, hidden), said, SHOWN).astype(np.uint8)
+        cells = cells_of_pixels(prepared.frame, plan, truth)
+        kept.append(KeptFrame(prepared.ref.name, prepared.frame, anchors, cells))
+    return tuple(kept)
+
+
+def cells_of_pixels(frame: Frame, plan: Plan, truth: CellTruth) -> UInt8[np.ndarray, "H W"]:
+    """The class of the cell that each pixel's point lies in; `IGNORE` where there is none."""
+    points_camera, valid = disparity_to_points(plan.front_end.camera, frame.disparity_px)
+    points_world = np.asarray(transform_points(frame.T_world_camera, points_camera))
+    depth_m, (least_m, most_m) = np.asarray(points_camera[..., 2]), plan.depth_range_m
+    used = np.asarray(valid) & (depth_m >= least_m) & (depth_m <= most_m)
+    return np.where(used, truth.of_points(points_world), np.uint8(IGNORE))
+
+
+def _split(
+    frames: tuple[KeptFrame, ...], share: float, name: str
+) -> tuple[tuple[KeptFrame, ...], tuple[KeptFrame, ...]]:
+    """The frames that teach and those that validate: the last ones, because neighbours look alike."""
+    held_out = round(len(frames) * share)
+    if len(frames) - held_out < 1:
+        raise JaxmapError(
+            f"{len(frames)} frames can be used, and {held_out} of them are held out",
+            where=name,
+            fix="give a longer sequence, or a smaller --data.validation-share",
+        )
+    return frames[: len(frames) - held_out], frames[len(frames) - held_out :]
+
+
+def _check_shown(counts: np.ndarray, data: MapData, config: TrainConfig) -> None:
+    """Refuses a ground truth that teaches nothing.
+
+    Raises:
+        JaxmapError: the cells that the frames see are not labelled, or all are of one class.
+    """
+    shown = [index for index in data.truth.rasters if counts[index]]
+    if len(shown) > 1:
+        return
+    what = "no cell that the frames see is labelled"
+    if shown:
+        what = f"all labelled cells that the frames see are {config.classes[shown[0]]}: one class teaches nothing"
+    raise JaxmapError(
+        what,
+        where=config.ground_truth,
+        fix="check that both are of one site and the poses true, or take a longer sequence",
+    )
+
+
+def _losses(config: TrainConfig, counts: np.ndarray, shown: Iterable[int]) -> dict[int, LossOptions]:
+    """The loss of each class against the rest, from the settings of losses of pixels."""
+    weights = class_weights(config.loss, counts)
+    losses = {}
+    for index in shown:
+        others = [weights[other] for other in shown if other != index]
+        losses[index] = LossOptions(
+            nll=config.loss.cross_entropy,
+            soft_iou=config.loss.soft_iou,
+            class_weight=float(weights[index] / np.mean(others)),
+        )
+    return losses
+
+
+def _told(data: MapData, counts: np.ndarray) -> str:
+    """One line on frames and truth."""
+    classes, seen = data.plan.labeller.classes, int(counts.sum())
+    pixels = sum(kept.cells.size for kept in data.train)
+    shares = ", ".join(f"{classes[index]} {counts[index] / seen:.1%}" for index in data.truth.rasters)
+    return (
+        f"{len(data.train)} frames to map, {len(data.validation)} to validate; "
+        f"{seen / pixels:.0%} of their pixels lie in labelled cells: {shares}"
+    )

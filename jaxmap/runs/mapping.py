@@ -1,0 +1,243 @@
+"""A mapping run from its plan to its outputs: what `jaxmap map` and `jaxmap demo` do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import jaxmap
+from jaxmap.ensemble.layer import named_layers
+from jaxmap.errors import JaxmapError
+from jaxmap.host.memory import peak_resident_mib
+from jaxmap.host.output_folder import write_json
+from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
+from jaxmap.mapping.store import MapAttributes, save_map
+from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
+from jaxmap.report.html import write_report
+from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
+from jaxmap.runs.log import RunLog
+from jaxmap.runs.mapping_plan import Plan, Tell
+from jaxmap.types import VoxelMap
+
+
+def run_plan(
+    plan: Plan,
+    folder: RunFolder,
+    *,
+    strict: bool,
+    checkpoint_every_s: float,
+    tell: Tell,
+    on_frame: Callable[[FusedFrame], None] = lambda fused: None,
+    profile: bool = False,
+) -> dict[str, Any]:
+    """Maps the sequence and writes all outputs.
+
+    A run folder that holds an interrupted run of the same settings is gone on with: the map comes
+    out as if the run had not been interrupted, bit for bit.
+
+    Args:
+        plan: the run.
+        folder: where it goes; `RunFolder.begin` was called.
+        strict: stop at the first frame that cannot be used.
+        checkpoint_every_s: how often the map is saved on the way.
+        tell: takes lines for the user.
+        on_frame: called after each frame.
+        profile: record a trace of some steps into the folder, and tell where their time went.
+
+    Returns:
+        The metrics, as they are in metrics.json.
+
+    Raises:
+        JaxmapError: no frame could be fused, or an output cannot be written.
+    """
+    voxel_map, log = _resumed(plan, folder) or (plan.mapper.init(), RunLog())
+    if log.complete:
+        tell("the run is complete already; its outputs are written anew")
+    elif log.next_index:
+        tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
+    step_profile, program = StepProfile(folder.profile if profile else None), None
+    saved_s = resumed_s = time.perf_counter()
+    frames = prepare_frames(
+        plan.sequence,
+        plan.front_end,
+        plan.label_folder,
+        needs=plan.labeller.needs,
+        pose_errors=plan.pose_errors,
+        first=log.next_index,
+    )
+    form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
+    run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form)
+    try:
+        for voxel_map, fused in run:
+            if fused.cost is not None:
+                program = fused.cost.program
+                log.temporary_bytes = fused.cost.temporary_bytes
+                log.compile_s += fused.cost.compile_s
+                # Compiling is told apart from mapping.
+                resumed_s += fused.cost.compile_s
+            log.add(fused)
+            if fused.info is not None:
+                step_profile.step_done()
+            on_frame(fused)
+            if fused.info is not None and fused.prepared.index in plan.key_frames:
+                _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
+            if time.perf_counter() - saved_s > checkpoint_every_s:
+                log.total_s += time.perf_counter() - resumed_s
+                save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
+                saved_s = resumed_s = time.perf_counter()
+    except KeyboardInterrupt:
+        # Only where map and log speak of the same frames: the interrupt may come between the two.
+        if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
+            save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
+            tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
+        raise
+    finally:
+        step_profile.close()
+    log.total_s += time.perf_counter() - resumed_s
+    if not log.fused:
+        raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
+
+    log.complete = True
+    details = _profile(step_profile, program, tell) if profile else {}
+    metrics = _write_outputs(plan, folder, log, voxel_map, details)
+    if not metrics["voxels"]["occupied"]:
+        tell("note: no voxel is occupied: check the bounds, the range and the poses")
+    return metrics
+
+
+def _write_outputs(
+    plan: Plan, folder: RunFolder, log: RunLog, voxel_map: VoxelMap, details: dict[str, Any]
+) -> dict[str, Any]:
+    """Writes all that a run leaves, and returns its metrics, the details among them."""
+    attributes = _attributes(plan, log, voxel_map)
+    save_map(folder.map, voxel_map, attributes)
+    skipped = {frame["frame"] for frame in log.skipped}
+    fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
+    timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
+    write_poses(
+        folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
+    )
+    write_exports(folder, voxel_map, attributes)
+    metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map) | details
+    write_json(folder.metrics, metrics)
+    write_report(folder.path)
+    return metrics
+
+
+def _profile(step_profile: StepProfile, program: Callable[[], str | None] | None, tell: Tell) -> dict[str, Any]:
+    """What metrics.json holds of the steps that were traced."""
+    summary = step_profile.summary(program)
+    if summary is None:
+        tell(f"note: {step_profile.steps} frames are too few for a profile: it takes more than {WARM_UP_FRAMES}")
+        return {}
+    for line in table_lines(summary):
+        tell(line)
+    return {"profile": summary}
+
+
+def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
+    """Where an interrupted run of the same plan has got to.
+
+    Raises:
+        JaxmapError: the sequence has changed since, so that the run cannot go on as if it had not.
+    """
+    saved = folder.resume_point()
+    if saved is None:
+        return None
+    voxel_map, log = saved
+    same_frames = log.next_index <= len(plan.sequence.frames) and log.digest == plan.digest(log.next_index)
+    # A sequence that has grown since goes on where it ended.
+    log.complete = log.complete and log.next_index == len(plan.sequence.frames)
+    same_grid = (
+        voxel_map.grid.shape == plan.grid.shape
+        and voxel_map.classes == plan.labeller.classes
+        and np.array_equal(voxel_map.grid.origin_m, plan.grid.origin_m)
+        and np.array_equal(voxel_map.grid.voxel_size_m, plan.grid.voxel_size_m)
+        and (0 if voxel_map.members is None else len(voxel_map.members)) == plan.members
+    )
+    if not (same_frames and same_grid):
+        raise JaxmapError(
+            f"the {'bounds of the map' if same_frames else 'frames, poses or camera'} are not those of the run so far",
+            where=folder.path,
+            fix="bring the sequence back as it was, or map it anew with --overwrite",
+        )
+    return saved
+
+
+def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
+    log.digest = plan.digest(log.next_index)
+    return MapAttributes(
+        crs=plan.sequence.crs,
+        site_origin=plan.sequence.site_origin,
+        T_world_source=plan.sequence.T_world_source,
+        fusion=plan.fusion,
+        progress=log.as_json(),
+        layers=named_layers(voxel_map, plan.params.fusion, plan.rule),
+    )
+
+
+def _write_key_frame(plan: Plan, folder: RunFolder, prepared: PreparedFrame, number: int) -> None:
+    """Pictures of one frame, with the labels that the step gave it as the `number`-th."""
+    assert prepared.frame is not None and prepared.rectified is not None
+    labels = None
+    if plan.labeller.classes:
+        labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
+    write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
+
+
+def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
+    """What metrics.json holds."""
+    sequence, camera, grid = plan.sequence, plan.front_end.camera, plan.grid
+    steps_m = np.linalg.norm(np.diff(sequence.T_world_camera[:, :3, 3], axis=0), axis=1)
+    camera_numbers = {
+        name: round(float(getattr(camera, name)), 6)
+        for name in ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m", "doffs_px")
+    }
+    return {
+        "jaxmap_version": jaxmap.__version__,
+        "sequence": {
+            "name": sequence.name,
+            "dataset": sequence.dataset,
+            "frames": len(sequence.frames),
+            "fused": log.fused,
+            "skipped": log.skipped,
+            "crs": sequence.crs,
+            "site_origin": sequence.site_origin.tolist(),
+            "path_length_m": round(float(steps_m.sum()), 3),
+            "notes": list(sequence.notes),
+        },
+        "camera": camera_numbers
+        | {
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "rectified_here": plan.front_end.rectifier is not None,
+        },
+        "grid": {
+            "shape": list(grid.shape),
+            "voxel_size_m": np.asarray(grid.voxel_size_m, np.float64).round(6).tolist(),
+            "origin_m": np.asarray(grid.origin_m, np.float64).round(6).tolist(),
+            "depth_range_m": list(plan.depth_range_m),
+        },
+        "labeller": plan.labeller.name,
+        **({"model": {"file": str(plan.model.path), "sha256": plan.model.sha256}} if plan.model is not None else {}),
+        "times": {
+            "total_s": round(log.total_s, 3),
+            "compile_s": round(log.compile_s, 3),
+            "frames_per_s": round(log.fused / max(log.total_s, 1e-9), 3),
+            "stages": log.stage_summary(),
+        },
+        "points": {
+            "valid_fraction": round(log.valid_fractions.percentile(50), 4),
+            "fused": log.points_fused,
+        },
+        "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),
+        "memory": {
+            "map_mib": round(voxel_map.log_odds.nbytes / 2**20, 2),
+            **({"members_mib": round(members.nbytes / 2**20, 2)} if (members := voxel_map.members) is not None else {}),
+            "step_temporary_mib": round(log.temporary_bytes / 2**20, 2),
+            "peak_resident_mib": round(peak_resident_mib(), 1),
+        },
+    }

@@ -1,0 +1,391 @@
+"""A mapping run, decided in full before the first frame: what is read, its range, bounds and step."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
+from jaxmap.datasets.label_files import LabelFolder, open_label_folder
+from jaxmap.datasets.registry import SAMPLE_PREFIX
+from jaxmap.ensemble.draws import draw_ensemble
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
+from jaxmap.host.files import bundled
+from jaxmap.labellers.base import Labeller, make_no_labeller
+from jaxmap.labellers.deeplab import make_deeplab_labeller
+from jaxmap.labellers.files import make_files_labeller
+from jaxmap.labellers.plane import make_plane_labeller
+from jaxmap.labels import ROVER_CLASSES
+from jaxmap.mapping.sequence import frame_form
+from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
+from jaxmap.models.checkpoint import SavedModel, load_network
+from jaxmap.models.tensor_files import shortened
+from jaxmap.runs.config import GridConfig, MapConfig, Triple, split_fusion
+from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.rectify import StereoRig
+from jaxmap.types import Frame, GridSpec, StereoCamera, make_grid
+
+DEFAULT_VOXELS_M: tuple[Triple, ...] = ((0.05, 0.05, 0.2), (0.1, 0.1, 0.2), (0.2, 0.2, 0.2))
+"""The voxels of a map whose settings name none, the finest that fits."""
+
+
+def choose_grid(
+    config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float, class_count: int
+) -> GridSpec:
+    """The grid that the settings ask for; voxels of no given size are as fine as the memory allows.
+
+    Args:
+        config: the settings.
+        sequence: whose views it must hold.
+        front_end: of the sequence.
+        max_depth_m: how far its views reach.
+        class_count: how many classes the map has.
+
+    Raises:
+        JaxmapError: the bounds do not make a box, or no camera sees it.
+    """
+    if config.grid.voxel_size_m is not None:
+        return _grid_of(config.grid, config.grid.voxel_size_m, sequence, front_end, max_depth_m)
+    limit_bytes = config.grid.max_memory_gib * 2**30
+    *finer, coarsest_m = DEFAULT_VOXELS_M
+    for size_m in finer:
+        grid = _grid_of(config.grid, size_m, sequence, front_end, max_depth_m)
+        if map_bytes(grid, class_count, config.ensemble.members) <= limit_bytes:
+            return grid
+    return _grid_of(config.grid, coarsest_m, sequence, front_end, max_depth_m)
+
+
+def _grid_of(
+    settings: GridConfig,
+    voxel_size_m: float | Triple,
+    sequence: StereoSequence,
+    front_end: StereoFrontEnd,
+    max_depth_m: float,
+) -> GridSpec:
+    views = grid_around_views(
+        front_end.camera,
+        sequence.T_world_camera @ front_end.T_raw_rectified,
+        max_depth_m,
+        voxel_size_m,
+        (settings.below_camera_m, settings.above_camera_m),
+    )
+    if (settings.lower_m is None) != (settings.upper_m is None):
+        raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
+    if settings.lower_m is None or settings.upper_m is None:
+        return views
+    grid = make_grid(settings.lower_m, settings.upper_m, voxel_size_m)
+    lower, upper = _extent(views)
+    if (np.array(settings.lower_m) >= upper).any() or (np.array(settings.upper_m) <= lower).any():
+        raise UsageError(
+            f"no camera sees the box from {list(settings.lower_m)} to {list(settings.upper_m)}: "
+            f"the views reach from {lower.round(1).tolist()} to {upper.round(1).tolist()}",
+            where="grid bounds",
+            fix="give bounds relative to the site origin",
+        )
+    return grid
+
+
+def _extent(grid: GridSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of a grid, float64."""
+    lower = np.asarray(grid.origin_m, np.float64)
+    return lower, lower + np.asarray(grid.voxel_size_m, np.float64) * grid.shape
+
+
+def told_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
+    """One line on what is mapped, and the memory it takes."""
+    size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
+    return (
+        f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
+        f"{size} m, {1 + class_count} channels{f' and {members} members of 2' if members else ''}: "
+        f"{map_bytes(grid, class_count, members) / 2**20:.0f} MiB"
+    )
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """The file of the network that labels, and the SHA-256 of its content."""
+
+    path: Path
+    sha256: str
+
+
+def choose_label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFolder | None:
+    """The folder of labels that the settings name, where labels come from files.
+
+    Raises:
+        JaxmapError: it cannot be read.
+        UsageError: it is missing, or means nothing to the labeller.
+    """
+    if config.labeller != "files":
+        if config.labels is not None:
+            raise UsageError(
+                f"--labels is given, but the labeller is {config.labeller}", fix="add --labeller files, or leave it out"
+            )
+        return None
+    if config.labels is None:
+        raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
+    labels_are = config.labels_are
+    if labels_are == "auto":
+        if isinstance(sequence.camera, StereoRig):
+            raise UsageError(
+                "the images are raw, and labels may lie on raw or on rectified pixels",
+                fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
+            )
+        labels_are = "rectified"
+    return open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
+
+
+def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
+    """The network that labels, where the labeller is one.
+
+    Raises:
+        JaxmapError: the file cannot be read, or holds no whole network.
+        UsageError: it is not the one that the settings tell.
+    """
+    if config.labeller != "deeplab":
+        if config.model is not None:
+            raise UsageError(
+                f"--model is given, but the labeller is {config.labeller}",
+                fix="add --labeller deeplab, or leave it out",
+            )
+        return None, None
+    path = config.model or bundled("rover.safetensors")
+    saved = load_network(path)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    if config.model_sha256 is not None and config.model_sha256.lower() != sha256:
+        raise UsageError(
+            f"the model's SHA-256 does not start with {config.model_sha256[:16]}",
+            where=path,
+            fix="give the model of that run, or leave out model_sha256",
+        )
+    return ModelFile(path, sha256), saved
+
+
+def told_network(model: ModelFile, network: SavedModel, classes: Sequence[str]) -> str:
+    """One line on the network and its classes."""
+    count = len(network.architecture.classes)
+    return (
+        f"labels by {model.path.name} ({network.architecture.backbone}, {count} classes), "
+        f"mapped as {shortened(classes)}; the settings classes and deeplab.class_map choose"
+    )
+
+
+def choose_labeller(config: MapConfig, label_folder: LabelFolder | None, network: SavedModel | None) -> Labeller:
+    """What labels the points.
+
+    Args:
+        config: the settings.
+        label_folder: of the files labeller.
+        network: of the deeplab labeller.
+
+    Raises:
+        JaxmapError: classes or numbers that do not serve.
+    """
+    classes = config.classes
+    if classes is not None and len(set(classes)) < len(classes):
+        raise UsageError(f"a class is named twice: {' '.join(classes)}", fix="give each class once")
+    if network is not None:
+        return make_deeplab_labeller(network, classes, **asdict(config.deeplab))
+    classes = ROVER_CLASSES if classes is None else classes
+    if label_folder is not None:
+        return make_files_labeller(classes, soft=label_folder.soft)
+    if config.labeller == "plane":
+        return make_plane_labeller(classes, **asdict(config.plane))
+    return make_no_labeller()
+
+
+Tell = Callable[[str], None]
+
+_KEY_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run, decided in full before the first frame is fused."""
+
+    source: str
+    sequence: StereoSequence
+    front_end: StereoFrontEnd
+    labeller: Labeller
+    label_folder: LabelFolder | None
+    model: ModelFile | None
+    grid: GridSpec
+    depth_range_m: tuple[float, float]
+    rule: FusionRule
+    params: MapperParams
+    fusion: dict[str, Any]
+    mapper: Mapper
+    key: PRNGKeyArray
+    pose_errors: Float[np.ndarray, "N M 6"] | None = None
+    """Of the members of an ensemble, for each frame."""
+
+    @property
+    def members(self) -> int:
+        """How many members the ensemble has."""
+        return 0 if self.pose_errors is None else self.pose_errors.shape[1]
+
+    @property
+    def frame_form(self) -> Frame:
+        """The form of the frames that the step takes."""
+        return frame_form(self.front_end.camera, self.labeller, self.members)
+
+    @property
+    def key_frames(self) -> set[int]:
+        """Indices of the frames whose pictures are kept."""
+        return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """Settings that were left to the data, as they have come out."""
+        classes = {"classes": list(self.labeller.classes)} if self.labeller.classes else {}
+        return classes | ({"model_sha256": self.model.sha256} if self.model is not None else {})
+
+    def digest(self, count: int) -> str:
+        """A fingerprint of the first frames, their poses and the camera: what a resumed run must share."""
+        frames = self.sequence.frames[:count]
+        described = [(frame.name, frame.timestamp_s) for frame in frames]
+        camera = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(self.front_end.camera)]
+        poses = np.ascontiguousarray(self.sequence.T_world_camera[:count])
+        return hashlib.sha256(repr((described, camera)).encode() + poses.tobytes()).hexdigest()[:16]
+
+
+def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
+    """Opens the sequence and decides range, bounds, labeller and step.
+
+    Args:
+        source: the folder of one sequence, or `sample:NAME`.
+        config: the settings.
+        tell: takes lines for the user.
+
+    Raises:
+        JaxmapError: the data or the settings do not serve.
+    """
+    options = ReadOptions(
+        dataset=config.dataset,
+        poses=config.poses,
+        poses_world=config.poses_world,
+        calibration=config.calibration,
+        camera=config.camera,
+        antenna_m=config.antenna_m,
+        start=config.start,
+        stop=config.stop,
+        stride=config.stride,
+        max_pose_gap_s=config.max_pose_gap_s,
+        crs=config.crs,
+    )
+    sequence = open_sequence(source, options)
+    front_end = StereoFrontEnd(sequence.camera, config.stereo)
+    camera = front_end.camera
+    _tell_sequence(sequence, camera, tell)
+    depth_range_m = _depth_range(config, camera)
+    label_folder = choose_label_folder(config, sequence)
+    model, network = choose_model(config)
+    with _as_usage_error():
+        labeller = choose_labeller(config, label_folder, network)
+        if model is not None and network is not None:
+            tell(told_network(model, network, labeller.classes))
+        grid = choose_grid(config, sequence, front_end, depth_range_m[1], len(labeller.classes))
+        params, rule = split_fusion(config.fusion, labeller.classes)
+        fusion_rule = FusionRule(**rule)
+        fusion_params = make_fusion_params(labeller.classes, **params)
+        members = _members(config, fusion_rule, labeller.classes)
+    tell(told_grid(grid, depth_range_m, len(labeller.classes), members))
+    check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
+    key = jax.random.key(config.seed)
+    ensemble, pose_errors = None, None
+    if members:
+        timestamps_s = np.array([frame.timestamp_s for frame in sequence.frames], np.float64)
+        ensemble, pose_errors = draw_ensemble(key, fusion_params, timestamps_s, config.ensemble)
+
+    return Plan(
+        source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
+        sequence=sequence,
+        front_end=front_end,
+        labeller=labeller,
+        label_folder=label_folder,
+        model=model,
+        grid=grid,
+        depth_range_m=depth_range_m,
+        rule=fusion_rule,
+        params=MapperParams(camera, fusion_params, labeller.params, ensemble),
+        fusion={"params": params, "rule": rule} | ({"ensemble": asdict(config.ensemble)} if members else {}),
+        mapper=make_mapper(
+            camera,
+            grid,
+            labeller,
+            fusion_rule,
+            depth_range_m,
+            members=members,
+            # The members of an ensemble stand elsewhere.
+            T_world_camera=None if members else sequence.T_world_camera @ front_end.T_raw_rectified,
+        ),
+        key=key,
+        pose_errors=pose_errors,
+    )
+
+
+def _tell_sequence(sequence: StereoSequence, camera: StereoCamera, tell: Tell) -> None:
+    """What was opened, what its reader noted, and where its world begins."""
+    tell(
+        f"{sequence.name} ({sequence.dataset}): {len(sequence.frames)} frames "
+        f"of {camera.width_px} x {camera.height_px} px, f {float(camera.fx_px):.2f} px, "
+        f"baseline {float(camera.baseline_m):.5f} m"
+    )
+    for note in sequence.notes:
+        tell(f"note: {note}")
+    if sequence.site_origin.any():
+        origin = " ".join(f"{number:.0f}" for number in sequence.site_origin)
+        tell(f"site origin {origin} ({sequence.crs or 'no CRS given: --crs'}); bounds are relative to it")
+
+
+def _depth_range(config: MapConfig, camera: StereoCamera) -> tuple[float, float]:
+    """The depths that are mapped, in metres; without a greatest one, as far as the camera is good for.
+
+    Raises:
+        UsageError: there is nothing between them.
+    """
+    max_depth_m = config.depth.max_m or usable_depth(camera, config.depth.max_sigma_m, config.fusion.disparity_sigma_px)
+    if not config.depth.min_m < max_depth_m:
+        raise UsageError(
+            f"depth.min_m {config.depth.min_m} is not below the greatest depth, {max_depth_m} m",
+            fix="set --depth.max-m",
+        )
+    return config.depth.min_m, max_depth_m
+
+
+def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int:
+    """How many members the ensemble has.
+
+    Raises:
+        UsageError: the map has no class that it could be asked about.
+    """
+    members = config.ensemble.members
+    if members and rule.target(classes) is None:
+        known = f"its classes are {' '.join(classes)}" if classes else "it has no class at all"
+        raise UsageError(
+            f"an ensemble tells where the map misses a priority class, and the map has none: {known}",
+            where="ensemble.members",
+            fix="name a class with --fusion.priority-classes, or leave the ensemble out",
+        )
+    return members
+
+
+@contextmanager
+def _as_usage_error() -> Iterator[None]:
+    """What is refused while settings are taken up is the fault of the settings."""
+    try:
+        yield
+    except UsageError:
+        raise
+    except JaxmapError as error:
+        raise UsageError(error.what, where=error.where, fix=error.fix or "see jaxmap map --help") from error
