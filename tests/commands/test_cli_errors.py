@@ -1,6 +1,6 @@
 """Every faulty input ends in one line that says what, where and what to do, and in the right exit status.
 
-The lines are kept in snapshots/cli_errors.txt; JAXMAP_UPDATE_SNAPSHOTS=1 pytest tests/test_cli_errors.py
+The lines are kept in snapshots/cli_errors.txt; JAXMAP_UPDATE_SNAPSHOTS=1 pytest tests/commands/test_cli_errors.py
 writes them anew.
 """
 
@@ -36,7 +36,7 @@ from tune_faults import TUNE_FAULTS
 import jaxmap
 from jaxmap.commands import COMMANDS
 
-SNAPSHOT = Path(__file__).parent / "snapshots" / "cli_errors.txt"
+SNAPSHOT = Path(__file__).parents[1] / "snapshots" / "cli_errors.txt"
 
 NAMED = {
     "one pair of another size": "f003",

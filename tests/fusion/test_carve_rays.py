@@ -25,7 +25,7 @@ from jaxmap.labellers.base import make_no_labeller
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.types import Frame, GridSpec, make_grid, make_stereo_camera
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts"))
+sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts"))
 
 from agreement.causes import CAUSES, agreement_of, explain
 from agreement.heights import ABOVE, BELOW, NO_TRUTH, SURFACE, true_voxels

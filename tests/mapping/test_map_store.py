@@ -19,6 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jaxmap
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
 from jaxmap.mapping import store as map_store
@@ -156,7 +157,7 @@ def test_a_real_kill_leaves_a_map(tmp_path) -> None:
         "    print(value, flush=True)\n"
     )
     path = tmp_path / "map.zarr"
-    folders = [str(Path(__file__).parent), str(Path(map_store.__file__).parents[1])]
+    folders = [str(Path(__file__).parents[1]), str(Path(jaxmap.__file__).parents[1])]
     command = [sys.executable, "-c", program, str(path), *folders]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdout.readline() == "1\n"
