@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from fixtures import map_words, scene_folder, shared_cache  # noqa: F401
 from networks import SMALL
-from test_mapping_run import planned
+from planned_runs import planned
 
 import jaxmap
 from jaxmap.fusion.params import make_fusion_params
@@ -67,7 +67,8 @@ def test_the_listener_hears():
 
 
 def test_help_does_not_even_import_numpy():
-    program = "import sys; from jaxmap.commands.main import main; main(['--help']); print([m for m in HEAVY if m in sys.modules])"
+    program = "import sys; from jaxmap.commands.main import main; main(['--help'])"
+    program += "; print([m for m in HEAVY if m in sys.modules])"
     heavy = ("numpy", "jax", "tyro", "pydantic", "rich", "yaml")
     done = subprocess.run(
         [sys.executable, "-c", f"HEAVY = {heavy}; {program}"],

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rigs import CAMERA, RIG
 from scenes import HEIGHT_PX, WIDTH_PX, scene_frame
-from test_front_end import CAMERA, RIG
 
 from jaxmap.datasets.base import FrameRef
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import rasterio
 from fixtures import FRAMES, cli, finished_run, map_words, scene_folder, shared_cache  # noqa: F401
+from planned_runs import config_of, log_odds, metrics_of, planned
 from scenes import ROCK, SAND
-from test_mapping_run import config_of, log_odds, metrics_of, planned
 
 from jaxmap.errors import JaxmapError
 from jaxmap.mapping.sequence import FusedFrame

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from fixtures import scene_folder, shared_cache  # noqa: F401
-from test_mapping_run import planned
+from planned_runs import planned
 
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import StepInfo

@@ -157,7 +157,7 @@ def test_a_real_kill_leaves_a_map(tmp_path) -> None:
         "    print(value, flush=True)\n"
     )
     path = tmp_path / "map.zarr"
-    folders = [str(Path(__file__).parents[1]), str(Path(jaxmap.__file__).parents[1])]
+    folders = [str(Path(__file__).parent), str(Path(jaxmap.__file__).parents[1])]
     command = [sys.executable, "-c", program, str(path), *folders]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdout.readline() == "1\n"

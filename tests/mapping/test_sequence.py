@@ -12,8 +12,8 @@ import pytest
 from fixtures import FRAMES, scene_copy, scene_folder, shared_cache  # noqa: F401
 from hypothesis import given
 from hypothesis import strategies as st
+from planned_runs import planned
 from scenes import scene_frame
-from test_mapping_run import planned
 
 from jaxmap.datasets.base import StereoPair
 from jaxmap.errors import FrameError, JaxmapError

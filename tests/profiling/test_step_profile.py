@@ -9,7 +9,7 @@ import jax
 import pytest
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
 from jax.profiler import ProfileData
-from test_mapping_run import planned
+from planned_runs import planned
 
 from jaxmap.errors import JaxmapError
 from jaxmap.mapping.sequence import prepare_frames

@@ -13,7 +13,7 @@ import yaml
 from fixtures import cli, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from networks import NETWORK_CLASSES, small_model, write_small_model
 from PIL import Image
-from test_mapping_run import log_odds, planned
+from planned_runs import log_odds, planned
 
 from jaxmap.commands.main import main
 from jaxmap.datasets.images import read_image

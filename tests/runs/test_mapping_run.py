@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -13,57 +12,22 @@ import rasterio
 import yaml
 from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from PIL import Image
+from planned_runs import config_of, log_odds, metrics_of, planned, ran, voxels_of
 from scenes import BASELINE_M, BOXES_M, ROCK, SAND, frame_name, pose, scene_frame, timestamp_s, write_folder_sequence
 
 import jaxmap.runs.mapping_plan
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
-from jaxmap.fusion.params import stored_fusion
+from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.geometry.bounds import grid_around_views, map_bytes
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.store import load_map
 from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping import run_plan
-from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M, Plan, plan_run
+from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M, plan_run
 
 OUTPUTS = ("map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "config.yaml", "poses.tum", "report.html")
-
-BOUNDS = {"lower_m": [-2.0, 0.0, -0.5], "upper_m": [2.0, 5.2, 1.0]}
-
-
-def config_of(**settings: object) -> MapConfig:
-    tree = config_tree(MapConfig())
-    tree["grid"] |= BOUNDS
-    for key, value in settings.items():
-        tree[key] = {**tree[key], **value} if isinstance(value, dict) else value
-    return check_config(tree)
-
-
-def planned(sequence: Path, **settings: object) -> Plan:
-    return plan_run(str(sequence), config_of(**settings), lambda line: None)
-
-
-def ran(sequence: Path, out: Path, **settings: object) -> dict:
-    folder = RunFolder(out)
-    config = config_of(**settings)
-    plan = planned(sequence, **settings)
-    folder.begin(plan, config, resume=False, overwrite=False)
-    return run_plan(plan, folder, strict=config.strict, checkpoint_every_s=60.0, tell=lambda line: None)
-
-
-def log_odds(run: Path) -> np.ndarray:
-    return np.asarray(load_map(run / "map.zarr")[0].log_odds)
-
-
-def voxels_of(run: Path) -> OccupiedVoxels:
-    voxel_map, attributes = load_map(run / "map.zarr")
-    return occupied_voxels(voxel_map, *stored_fusion(attributes.fusion, voxel_map.classes, "map"))
-
-
-def metrics_of(run: Path) -> dict:
-    return json.loads((run / "metrics.json").read_text())
 
 
 def read_ply(path: Path) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import reference
 from fixtures import cli, shared_cache  # noqa: F401
-from test_mapping_run import voxels_of
+from planned_runs import voxels_of
 
 from jaxmap.datasets import open_sequence
 from jaxmap.datasets.samples import motorcycle_disparity

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from killed import kill_when
+from planned_runs import config_of, log_odds, metrics_of, planned
 from scenes import write_folder_sequence
-from test_mapping_run import config_of, log_odds, metrics_of, planned
 
 from jaxmap.errors import JaxmapError
 from jaxmap.mapping import store as map_store

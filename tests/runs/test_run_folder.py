@@ -116,7 +116,7 @@ def test_poses_that_changed_do_not_go_on_in_the_same_map(cli, scene_copy, tmp_pa
 
 
 def test_an_interrupt_saves_what_is_there(scene_folder, tmp_path):
-    from test_mapping_run import config_of, planned
+    from planned_runs import config_of, planned
 
     plan, folder = planned(scene_folder), RunFolder(tmp_path / "run")
     folder.begin(plan, config_of(), resume=False, overwrite=False)
