@@ -183,7 +183,7 @@ def main() -> None:
         plan = looped(plan_run(str(Path(name, "views")), config, print), given.frames)
         watch, folder = Watch(plan, given.every), RunFolder(Path(name, "run"))
         folder.begin(plan, config, resume=False, overwrite=False)
-        options: dict[str, Any] = {"strict": True, "checkpoint_every_s": 30.0, "tell": print}
+        options: dict[str, Any] = {"strict": True, "checkpoint_every_s": 30.0, "notify": print}
         metrics = run_plan(watch.plan, folder, on_frame=watch.on_frame, **options)
     figures = summary(watch, metrics, given.every)
     print(json.dumps(figures, indent=2))

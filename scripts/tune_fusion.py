@@ -102,7 +102,7 @@ def tuned(labels: str, given: argparse.Namespace, kernel: int, out: Path) -> Map
         )
         for one in given.tune
     ]
-    run = TuningRun(sources, config, TruthOptions(), TuneOptions(kernel=kernel), out, tell=lambda line: None)
+    run = TuningRun(sources, config, TruthOptions(), TuneOptions(kernel=kernel), out, notify=lambda line: None)
     run.cache(lambda done: None)
     cached_s = time.perf_counter()
     result = run.tune(lambda step, note: None)

@@ -35,7 +35,7 @@ def ran(sequence: Path, out: Path, **settings: object) -> dict:
     config = config_of(**settings)
     plan = planned(sequence, **settings)
     folder.begin(plan, config, resume=False, overwrite=False)
-    return run_plan(plan, folder, strict=config.strict, checkpoint_every_s=60.0, tell=lambda line: None)
+    return run_plan(plan, folder, strict=config.strict, checkpoint_every_s=60.0, notify=lambda line: None)
 
 
 def log_odds(run: Path) -> np.ndarray:

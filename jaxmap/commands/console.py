@@ -59,7 +59,7 @@ class Console:
 
         self._rich = RichConsole(stderr=True, highlight=False, soft_wrap=True)
 
-    def tell(self, line: str) -> None:
+    def notify(self, line: str) -> None:
         """One line for the user."""
         self._rich.print(line, markup=False)
 

@@ -63,13 +63,13 @@ def main(words: Sequence[str]) -> int:
     truth = sample_truth()
     table = []
     for name, (labeller, preset, config) in demo_rows().items():
-        console.tell(f"--- {labeller}, {preset} ---")
+        console.notify(f"--- {labeller}, {preset} ---")
         metrics, scores = _map_and_score(arguments.out / name, config, truth, console)
         table.append({**scores, **_figures(metrics), "run": name, "labeller": labeller, "preset": preset})
     write_json(arguments.out / "table.json", table)
     write_demo_page(arguments.out, TITLE, COLUMNS, table, truth)
     console.table(TITLE, COLUMNS, table)
-    console.tell(summary(table[-1]))
+    console.notify(summary(table[-1]))
     console.result(arguments.out, ["report.html", "table.json", *(f"{row['run']}/" for row in table)])
     return 0
 
@@ -84,10 +84,10 @@ def _map_and_score(out: Path, config: MapConfig, truth: Path, console: Console) 
     from jaxmap.runs.mapping_plan import plan_run
 
     folder = RunFolder(out)
-    plan = plan_run(SAMPLE, config, console.tell)
+    plan = plan_run(SAMPLE, config, console.notify)
     with folder.locked():
         folder.begin(plan, config, resume=False, overwrite=True)
-        metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, tell=console.tell)
+        metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify)
     evaluation, class_map = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
     write_evaluation(folder.scores, folder.errors, evaluation, class_map, truth / "orthomosaic.tif")
     write_report(out)

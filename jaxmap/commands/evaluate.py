@@ -100,7 +100,7 @@ def main(words: Sequence[str]) -> int:
     scores = evaluation.scores
     write_evaluation(out, picture, evaluation, class_map, arguments.backdrop)
     for note in scores["notes"]:
-        console.tell(f"note: {note}")
+        console.notify(f"note: {note}")
     _print_scores(console, scores, summary(scores))
     names = [out.name, picture.name]
     if arguments.out is None and folder.metrics.is_file():
@@ -125,7 +125,7 @@ def _report_anew(console: Console, run: Path) -> list[str]:
     try:
         return [write_report(run).name]
     except JaxmapError as error:
-        console.tell(f"note: the report was not written anew: {error}")
+        console.notify(f"note: the report was not written anew: {error}")
         return []
 
 
@@ -133,7 +133,7 @@ def _print_scores(console: Console, scores: dict, title: str) -> None:
     rows = [{"over": "observed cells", **scores}, {"over": "all cells in view", **scores["in_view"]}]
     if moved := scores.get("registration"):
         rows.append({"over": "observed, before registration", **moved["before"]})
-        console.tell(
+        console.notify(
             f"registered: truth shifted {moved['shift_east_m']:+.3f} m east, {moved['shift_north_m']:+.3f} m north, "
             f"turned {moved['heading_deg']:+.2f} degrees"
         )

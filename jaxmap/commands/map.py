@@ -67,7 +67,7 @@ def main(words: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     folder = RunFolder(arguments.out)
-    plan = plan_run(arguments.sequence, config, console.tell)
+    plan = plan_run(arguments.sequence, config, console.notify)
     folder.check_apart(plan, config)
     with folder.locked(), console.progress("mapping", len(plan.sequence.frames)) as advance:
         folder.begin(plan, config, resume=arguments.resume, overwrite=arguments.overwrite)
@@ -76,13 +76,13 @@ def main(words: Sequence[str]) -> int:
             folder,
             strict=config.strict,
             checkpoint_every_s=arguments.checkpoint_every_s,
-            tell=console.tell,
+            notify=console.notify,
             on_frame=advance,
             profile=arguments.profile,
         )
-    console.tell(summary(metrics))
+    console.notify(summary(metrics))
     for skipped in metrics["sequence"]["skipped"]:
-        console.tell(f"skipped {skipped['frame']}: {skipped['reason']}")
+        console.notify(f"skipped {skipped['frame']}: {skipped['reason']}")
     missed, profile = ["missed.png"] if config.ensemble.members else [], ["profile/"] if arguments.profile else []
     console.result(arguments.out, (*OUTPUTS, *missed, *profile))
     return 0

@@ -126,7 +126,7 @@ def main(words: Sequence[str]) -> int:
             max_depth_m=arguments.max_depth_m,
             overwrite=arguments.overwrite,
             advance=lambda share, note: advance(round(100 * share), note),
-            tell=console.tell,
+            notify=console.notify,
         )
     _print(console, content)
     written = (*OUTPUTS, CALIBRATION) if set(arguments.adjust) - {"poses"} else OUTPUTS
@@ -178,13 +178,13 @@ def _check(arguments: RefineArguments) -> None:
 
 def _print(console: Console, content: dict[str, Any]) -> None:
     spread, residual, matches = content["map_height_spread_m"], content["match_residual_px"], content["matches"]
-    console.tell(
+    console.notify(
         f"{matches['count']:,} matches in {matches['pairs']} pairs of frames, off by {residual['before']:.2f} px "
         f"before and {residual['after']:.2f} px now; between frames heights differ by {100 * spread['before']:.1f} cm "
         f"before and {100 * spread['after']:.1f} cm now"
     )
     for note in content["notes"]:
-        console.tell(f"note: {note}")
+        console.notify(f"note: {note}")
     rows = [
         {"group": group, **{key: row[key] for key in ("name", "value", "sigma", "prior_sigma")}}
         | {"told": "yes" if row["observable"] else "no: as given"}

@@ -103,7 +103,7 @@ def _tell_scores(console: Console, summary: dict, file: Path | None) -> None:
     console.table(_title(summary), COLUMNS, _rows(summary))
     if file is not None:
         write_json(file, summary)
-        console.tell(f"scores: {file}")
+        console.notify(f"scores: {file}")
 
 
 COLUMNS = {"name": "class", "iou": "IoU", "precision": "precision", "recall": "recall", "pixels": "true pixels"}

@@ -67,9 +67,9 @@ def _traverse(arguments: SimulateArguments) -> int:
     console = Console()
     _tell_variant(console)
     with console.steps("rendering", "frames", options.frames) as advance:
-        pair_s = simulate_traverse(arguments.out, options, console.tell, advance)
+        pair_s = simulate_traverse(arguments.out, options, console.notify, advance)
     if pair_s:
-        console.tell(f"{pair_s:.1f} s per stereo pair")
+        console.notify(f"{pair_s:.1f} s per stereo pair")
     console.result(arguments.out, ["Part1/", "gt/", "calibration.yaml", "scene.json"])
     return 0
 
@@ -90,7 +90,7 @@ def _training(arguments: SimulateArguments) -> int:
     with console.steps("rendering", "images", options.images) as advance:
         image_s = simulate_training_set(arguments.out, options, advance)
     if image_s:
-        console.tell(f"{image_s:.1f} s per image")
+        console.notify(f"{image_s:.1f} s per image")
     console.result(arguments.out, ["images/", "masks/", "train.txt", "val.txt", "worlds/"])
     return 0
 
@@ -99,7 +99,7 @@ def _tell_variant(console: Console) -> None:
     from jaxmap.simulation.tracer import ADVICE, is_vectorised, load_mitsuba
 
     if not is_vectorised(load_mitsuba()):
-        console.tell(f"LLVM's library is not there: rays are traced one by one, a hundred times slower; {ADVICE}")
+        console.notify(f"LLVM's library is not there: rays are traced one by one, a hundred times slower; {ADVICE}")
 
 
 def _check(arguments: SimulateArguments) -> None:

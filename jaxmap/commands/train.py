@@ -65,13 +65,13 @@ def main(words: Sequence[str]) -> int:
     # All data are read for the plan: a folder that cannot be written is told before.
     with locked(arguments.out):
         if config.supervision == "map":
-            plan = plan_map_training(str(arguments.data_folder), config, arguments.init, tell=console.tell)
+            plan = plan_map_training(str(arguments.data_folder), config, arguments.init, notify=console.notify)
         else:
-            plan = plan_training(arguments.data_folder, config, arguments.init, tell=console.tell)
+            plan = plan_training(arguments.data_folder, config, arguments.init, notify=console.notify)
         folder.begin(plan, resume=arguments.resume, overwrite=arguments.overwrite)
         with console.steps("training", "steps", plan.order.steps) as advance:
-            metrics = TrainingRun(plan, folder, tell=console.tell, on_step=advance).run()
-    console.tell(_summary(metrics))
+            metrics = TrainingRun(plan, folder, notify=console.notify, on_step=advance).run()
+    console.notify(_summary(metrics))
     console.result(arguments.out, OUTPUTS)
     return 0
 

@@ -111,7 +111,7 @@ def main(words: Sequence[str]) -> int:
         TruthOptions(arguments.target, choose_coding(arguments.remap, arguments.palette), arguments.truth_crs),
         options,
         arguments.out,
-        tell=console.tell,
+        notify=console.notify,
     )
     with locked(arguments.out.parent):
         with console.steps("reading", "frames", run.frames) as advance:
@@ -120,7 +120,7 @@ def main(words: Sequence[str]) -> int:
             result = run.tune(advance)
     _print(console, result)
     for note in result["notes"]:
-        console.tell(f"note: {note}")
+        console.notify(f"note: {note}")
     out = arguments.out
     console.result(out.parent, [out.name, out.with_suffix(".json").name, out.with_suffix(".html").name])
     return 0

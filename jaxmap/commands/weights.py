@@ -78,7 +78,7 @@ def _import(arguments: ImportArguments) -> int:
 def _fetch(arguments: FetchArguments) -> int:
     from jaxmap.runs.weights import fetch
 
-    return _convert(fetch(arguments.name, mirror=arguments.mirror, tell=Console().tell), arguments)
+    return _convert(fetch(arguments.name, mirror=arguments.mirror, notify=Console().notify), arguments)
 
 
 def _convert(source: Path, arguments: ImportArguments | FetchArguments) -> int:
@@ -86,6 +86,6 @@ def _convert(source: Path, arguments: ImportArguments | FetchArguments) -> int:
 
     imported = convert_file(source, arguments.out, classes=arguments.classes, output_stride=arguments.output_stride)
     count = sum(array.size for array in imported.weights.values())
-    Console().tell(f"{imported.source}: {len(imported.weights)} arrays, {count / 1e6:.1f} million numbers")
+    Console().notify(f"{imported.source}: {len(imported.weights)} arrays, {count / 1e6:.1f} million numbers")
     print(f"wrote {arguments.out}")
     return 0

@@ -25,7 +25,7 @@ TRACED_FRAMES = 10
 class StepProfile:
     """Records a trace of a few steps of a run, after the first ones.
 
-    Tell it of each step that was made (`step_done`), and close it when no more come.
+    Notify it of each step that was made (`step_done`), and close it when no more come.
 
     Attributes:
         steps: how many were made; those after the first `WARM_UP_FRAMES` are traced.

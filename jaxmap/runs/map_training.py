@@ -31,9 +31,9 @@ from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.deeplab import Weights, fold_batch_norm
 from jaxmap.runs.evaluation import class_map_of
-from jaxmap.runs.mapping_plan import Plan, Tell, plan_run
+from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.runs.segmentation import Segmenter
-from jaxmap.runs.training_plan import TaughtMapping, TrainConfig, TrainingPlan, check_scale, option_here, told_start
+from jaxmap.runs.training_plan import TaughtMapping, TrainConfig, TrainingPlan, check_scale, describe_start, option_here
 from jaxmap.training.batches import BATCHES_AHEAD, Order
 from jaxmap.training.losses import class_weights
 from jaxmap.training.starts import make_start
@@ -246,14 +246,14 @@ _OF_THE_NETWORK = ("labeller", "model", "model_sha256", "labels", "labels_are", 
 """Settings of a mapping that say what labels; here that is the network which is trained."""
 
 
-def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, tell: Tell) -> TrainingPlan:
+def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, notify: Notify) -> TrainingPlan:
     """Reads the sequence and the orthomosaic, prepares all frames once, and builds network and step.
 
     Args:
         source: the folder of one sequence, or `sample:NAME`.
         config: the settings.
         init: the network to start from; the bundled one by default.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
 
     Raises:
         JaxmapError: sequence, orthomosaic, settings and network do not serve.
@@ -272,15 +272,15 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, te
         )
     mapping = replace(config.mapping, model=path, classes=config.classes)
     with options_as(option_here):
-        plan = plan_run(source, mapping, lambda line: tell(with_options(line, option_here)))
+        plan = plan_run(source, mapping, lambda line: notify(with_options(line, option_here)))
         truth, truths = read_cells(plan, config)
-        frames = keep_frames(plan, truth, saved, config.map_truth.anchor, tell)
+        frames = keep_frames(plan, truth, saved, config.map_truth.anchor, notify)
     train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
     data = MapData(plan, truth, train, validation, config.ground_truth.name)
     counts = class_pixels(train, len(config.classes))
     _check_shown(counts, data, config)
-    tell(_told(data, counts))
-    tell(told_start(start))
+    notify(_told(data, counts))
+    notify(describe_start(start))
     order = Order.of(len(train), config)
     site = Site(
         camera=plan.front_end.camera,
@@ -370,7 +370,9 @@ def _place(plan: Plan) -> Extent:
     return Extent(float(low[0]), float(low[1]), float(high[0]), float(high[1]), plan.sequence.crs)
 
 
-def keep_frames(plan: Plan, truth: CellTruth, first: SavedModel, anchor: float, tell: Tell) -> tuple[KeptFrame, ...]:
+def keep_frames(
+    plan: Plan, truth: CellTruth, first: SavedModel, anchor: float, notify: Notify
+) -> tuple[KeptFrame, ...]:
     """All frames that can be used, prepared; the others are told.
 
     Raises:
@@ -389,7 +391,7 @@ def keep_frames(plan: Plan, truth: CellTruth, first: SavedModel, anchor: float, 
     kept = []
     for prepared in prepare_frames(plan.sequence, plan.front_end, needs="image"):
         if prepared.frame is None or prepared.rectified is None:
-            tell(f"skipped: {prepared.fault}")
+            notify(f"skipped: {prepared.fault}")
             continue
         anchors = np.full(prepared.frame.disparity_px.shape, IGNORE, np.uint8)
         if teacher is not None:

@@ -19,7 +19,7 @@ from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lin
 from jaxmap.report.html import write_report
 from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.runs.log import RunLog
-from jaxmap.runs.mapping_plan import Plan, Tell
+from jaxmap.runs.mapping_plan import Notify, Plan
 from jaxmap.types import VoxelMap
 
 
@@ -29,7 +29,7 @@ def run_plan(
     *,
     strict: bool,
     checkpoint_every_s: float,
-    tell: Tell,
+    notify: Notify,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
     profile: bool = False,
 ) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def run_plan(
         folder: where it goes; `RunFolder.begin` was called.
         strict: stop at the first frame that cannot be used.
         checkpoint_every_s: how often the map is saved on the way.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
         on_frame: called after each frame.
         profile: record a trace of some steps into the folder, and tell where their time went.
 
@@ -55,9 +55,9 @@ def run_plan(
     """
     voxel_map, log = _resumed(plan, folder) or (plan.mapper.init(), RunLog())
     if log.complete:
-        tell("the run is complete already; its outputs are written anew")
+        notify("the run is complete already; its outputs are written anew")
     elif log.next_index:
-        tell(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
+        notify(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
     step_profile, program = StepProfile(folder.profile if profile else None), None
     saved_s = resumed_s = time.perf_counter()
     frames = prepare_frames(
@@ -92,7 +92,7 @@ def run_plan(
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
             save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
-            tell(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
+            notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
         step_profile.close()
@@ -101,10 +101,10 @@ def run_plan(
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    details = _profile(step_profile, program, tell) if profile else {}
+    details = _profile(step_profile, program, notify) if profile else {}
     metrics = _write_outputs(plan, folder, log, voxel_map, details)
     if not metrics["voxels"]["occupied"]:
-        tell("note: no voxel is occupied: check the bounds, the range and the poses")
+        notify("note: no voxel is occupied: check the bounds, the range and the poses")
     return metrics
 
 
@@ -127,14 +127,14 @@ def _write_outputs(
     return metrics
 
 
-def _profile(step_profile: StepProfile, program: Callable[[], str | None] | None, tell: Tell) -> dict[str, Any]:
+def _profile(step_profile: StepProfile, program: Callable[[], str | None] | None, notify: Notify) -> dict[str, Any]:
     """What metrics.json holds of the steps that were traced."""
     summary = step_profile.summary(program)
     if summary is None:
-        tell(f"note: {step_profile.steps} frames are too few for a profile: it takes more than {WARM_UP_FRAMES}")
+        notify(f"note: {step_profile.steps} frames are too few for a profile: it takes more than {WARM_UP_FRAMES}")
         return {}
     for line in table_lines(summary):
-        tell(line)
+        notify(line)
     return {"profile": summary}
 
 

@@ -101,7 +101,7 @@ def _extent(grid: GridSpec) -> tuple[np.ndarray, np.ndarray]:
     return lower, lower + np.asarray(grid.voxel_size_m, np.float64) * grid.shape
 
 
-def told_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
+def describe_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
     """One line on what is mapped, and the memory it takes."""
     size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
     return (
@@ -171,7 +171,7 @@ def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None
     return ModelFile(path, sha256), saved
 
 
-def told_network(model: ModelFile, network: SavedModel, classes: Sequence[str]) -> str:
+def describe_network(model: ModelFile, network: SavedModel, classes: Sequence[str]) -> str:
     """One line on the network and its classes."""
     count = len(network.architecture.classes)
     return (
@@ -204,7 +204,7 @@ def choose_labeller(config: MapConfig, label_folder: LabelFolder | None, network
     return make_no_labeller()
 
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 _KEY_FRAMES = 4
 
@@ -259,13 +259,13 @@ class Plan:
         return hashlib.sha256(repr((described, camera)).encode() + poses.tobytes()).hexdigest()[:16]
 
 
-def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
+def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
     """Opens the sequence and decides range, bounds, labeller and step.
 
     Args:
         source: the folder of one sequence, or `sample:NAME`.
         config: the settings.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
 
     Raises:
         JaxmapError: the data or the settings do not serve.
@@ -286,20 +286,20 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     sequence = open_sequence(source, options)
     front_end = StereoFrontEnd(sequence.camera, config.stereo)
     camera = front_end.camera
-    _tell_sequence(sequence, camera, tell)
+    _describe_sequence(sequence, camera, notify)
     depth_range_m = _depth_range(config, camera)
     label_folder = choose_label_folder(config, sequence)
     model, network = choose_model(config)
     with _as_usage_error():
         labeller = choose_labeller(config, label_folder, network)
         if model is not None and network is not None:
-            tell(told_network(model, network, labeller.classes))
+            notify(describe_network(model, network, labeller.classes))
         grid = choose_grid(config, sequence, front_end, depth_range_m[1], len(labeller.classes))
         params, rule = split_fusion(config.fusion, labeller.classes)
         fusion_rule = FusionRule(**rule)
         fusion_params = make_fusion_params(labeller.classes, **params)
         members = _members(config, fusion_rule, labeller.classes)
-    tell(told_grid(grid, depth_range_m, len(labeller.classes), members))
+    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members))
     check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
@@ -334,18 +334,18 @@ def plan_run(source: str, config: MapConfig, tell: Tell) -> Plan:
     )
 
 
-def _tell_sequence(sequence: StereoSequence, camera: StereoCamera, tell: Tell) -> None:
+def _describe_sequence(sequence: StereoSequence, camera: StereoCamera, notify: Notify) -> None:
     """What was opened, what its reader noted, and where its world begins."""
-    tell(
+    notify(
         f"{sequence.name} ({sequence.dataset}): {len(sequence.frames)} frames "
         f"of {camera.width_px} x {camera.height_px} px, f {float(camera.fx_px):.2f} px, "
         f"baseline {float(camera.baseline_m):.5f} m"
     )
     for note in sequence.notes:
-        tell(f"note: {note}")
+        notify(f"note: {note}")
     if sequence.site_origin.any():
         origin = " ".join(f"{number:.0f}" for number in sequence.site_origin)
-        tell(f"site origin {origin} ({sequence.crs or 'no CRS given: --crs'}); bounds are relative to it")
+        notify(f"site origin {origin} ({sequence.crs or 'no CRS given: --crs'}); bounds are relative to it")
 
 
 def _depth_range(config: MapConfig, camera: StereoCamera) -> tuple[float, float]:

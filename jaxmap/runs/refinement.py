@@ -147,7 +147,7 @@ class RefineInputs:
 
 Advance = Callable[[float, str], None]
 """Told the share that is done, and what is being done."""
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 def read_inputs(source: str, options: ReadOptions, advance: Advance = lambda done, note: None) -> RefineInputs:
@@ -279,7 +279,7 @@ def run_refine(
     max_depth_m: float | None = None,
     overwrite: bool = False,
     advance: Advance = lambda done, note: None,
-    tell: Tell = lambda line: None,
+    notify: Notify = lambda line: None,
 ) -> dict[str, Any]:
     """Refines a sequence and writes what comes out, after every round the best so far.
 
@@ -292,7 +292,7 @@ def run_refine(
         max_depth_m: farther points do not count; by default where depth noise reaches `DEPTH_SIGMA_M`.
         overwrite: replace a refinement that lies in the folder.
         advance: told how far it is.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
 
     Returns:
         What is in refine.json.
@@ -304,7 +304,7 @@ def run_refine(
         begin(out, overwrite=overwrite)
         inputs = read_inputs(source, options, advance)
         for note in inputs.sequence.notes:
-            tell(f"note: {note}")
+            notify(f"note: {note}")
         return _refined(out, inputs, prior, files, max_depth_m, advance)
 
 

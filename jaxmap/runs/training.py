@@ -223,7 +223,7 @@ class TrainingRun:
     Args:
         plan: the run.
         folder: where it is written.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
         on_step: is called with the steps taken and a line on how it goes.
     """
 
@@ -232,10 +232,10 @@ class TrainingRun:
         plan: TrainingPlan,
         folder: TrainingFolder,
         *,
-        tell: Callable[[str], None],
+        notify: Callable[[str], None],
         on_step: Callable[[int, str], None] = lambda steps, note: None,
     ) -> None:
-        self._plan, self._folder, self._tell, self._on_step = plan, folder, tell, on_step
+        self._plan, self._folder, self._notify, self._on_step = plan, folder, notify, on_step
         self._checkpoints = Checkpoints(folder.checkpoints)
         self._validator = plan.data.validator(plan.start.architecture)
         self._log = TrainingLog(digest=plan.data.digest())
@@ -255,7 +255,7 @@ class TrainingRun:
         state = self._restored(plan.trainer.init(plan.start.weights))
         state = jax.device_put(state, share.replicated)
         if self._log.complete:
-            self._tell("the run is complete; nothing is left to do")
+            self._notify("the run is complete; nothing is left to do")
             return metrics_of(self._plan, self._log)
         key = jax.device_put(jax.random.key(plan.config.seed), share.replicated)
         epoch = len(self._log.history)
@@ -279,7 +279,7 @@ class TrainingRun:
         except KeyboardInterrupt:
             place = f"epoch {min(epoch + 1, plan.config.epochs)} of {plan.config.epochs}"
             self._stop(f"Interrupted in {place}.")
-            self._tell(f"interrupted in {place}, which --resume begins again")
+            self._notify(f"interrupted in {place}, which --resume begins again")
             raise
         return metrics_of(self._plan, self._log)
 
@@ -308,7 +308,7 @@ class TrainingRun:
                 fix="restore them, or start anew with --overwrite",
             )
         self._log = log
-        self._tell(f"going on after epoch {len(log.history)} of {self._plan.config.epochs}")
+        self._notify(f"going on after epoch {len(log.history)} of {self._plan.config.epochs}")
         return saved.state
 
     def _check_finite(self, info: StepInfo, step: int, epoch: int) -> None:
@@ -357,7 +357,7 @@ class TrainingRun:
             self._log.best = self._log.last
         if better or self._plan.config.keep == "last":
             self._save_model(weights)
-        self._tell(_told(epoch + 1, validation))
+        self._notify(_told(epoch + 1, validation))
         ious = {f"iou_{name}": values["iou"] for name, values in validation.summary["classes"].items()}
         return {
             "val_loss": validation.loss,

@@ -262,7 +262,7 @@ def plan_training(
     config: TrainConfig,
     init: Path | None,
     *,
-    tell: Callable[[str], None],
+    notify: Callable[[str], None],
     advance: Callable[[int], None] = lambda done: None,
 ) -> TrainingPlan:
     """Reads all the data once, and builds network and step.
@@ -271,7 +271,7 @@ def plan_training(
         folder: of the training data.
         config: the settings.
         init: a model file to start from.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
         advance: is called with the number of images read so far.
 
     Raises:
@@ -296,9 +296,9 @@ def plan_training(
         seed=config.seed,
     )
     for note in training_set.notes:
-        tell(f"note: {note}")
+        notify(f"note: {note}")
     counts = check_training_set(training_set, advance)
-    tell(
+    notify(
         f"{len(training_set.train)} images to train on, {len(training_set.validation)} to validate; training pixels: "
         + ", ".join(
             f"{name} {share:.1%}" for name, share in zip(config.classes, counts[0] / counts[0].sum(), strict=True)
@@ -307,7 +307,7 @@ def plan_training(
     saved = None if init is None else load_model(init)
     start = make_start(config.network, config.norm, config.classes, saved, seed=config.seed, where=init or "network")
     order = Order.of(len(training_set.train), config)
-    tell(told_start(start))
+    notify(describe_start(start))
     trainer = make_trainer(
         start.architecture,
         config,
@@ -330,7 +330,7 @@ def check_scale(config: TrainConfig) -> None:
         raise UsageError(f"augmentation.scale is {low} {high}", fix="give the least factor first")
 
 
-def told_start(start: Start) -> str:
+def describe_start(start: Start) -> str:
     """One line on the network and its first weights."""
     record, numbers = start.architecture, sum(jnp.size(weight) for weight in start.weights.values())
     return (

@@ -20,7 +20,7 @@ from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.report.tuning_page import tuning_page
 from jaxmap.runs.config import MapConfig, check_config, config_tree
 from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.runs.mapping_plan import Plan, Tell, plan_run
+from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
 from jaxmap.tuning.descent import DescentOptions, Step, descend
 from jaxmap.tuning.evidence_cache import BLOCK_PX, CacheRecipe, build_cache, tunable_labels
@@ -158,7 +158,7 @@ class TuningPlan(NamedTuple):
 
 
 def plan_tuning(
-    sources: Sequence[Source], config: MapConfig, target: str, options: TuneOptions, tell: Tell
+    sources: Sequence[Source], config: MapConfig, target: str, options: TuneOptions, notify: Notify
 ) -> TuningPlan:
     """Opens the sequences and decides what is tuned.
 
@@ -167,7 +167,7 @@ def plan_tuning(
         config: how they are mapped; the start of what is tuned.
         target: name of the class that is scored.
         options: of tuning.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
 
     Raises:
         JaxmapError: a sequence cannot be opened, or the settings do not serve.
@@ -176,7 +176,7 @@ def plan_tuning(
     mappings: list[Plan] = []
     for source in sources:
         mine = replace(config, labels=source.labels or config.labels, poses=source.poses or config.poses)
-        mappings.append(plan_run(source.sequence, mine, tell))
+        mappings.append(plan_run(source.sequence, mine, notify))
         if len(mappings) == 1:
             # What a sequence leaves open is decided once: the numbers hold for these voxels and this range.
             config = _decided(config, mappings[0])
@@ -231,7 +231,7 @@ class TuningRun:
         truth: how the ground truth is read.
         options: of tuning.
         out: the YAML file to write; scores and page go beside it.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
     """
 
     def __init__(
@@ -242,11 +242,11 @@ class TuningRun:
         options: TuneOptions,
         out: Path,
         *,
-        tell: Tell,
+        notify: Notify,
     ) -> None:
-        self._truth, self._options, self._out, self._tell = truth, options, out, tell
+        self._truth, self._options, self._out, self._notify = truth, options, out, notify
         self._sources = sources
-        plan = plan_tuning(sources, config, truth.target, options, tell)
+        plan = plan_tuning(sources, config, truth.target, options, notify)
         self._config, self._plans, self._target, self._start = plan
         self.frames = sum(len(plan.sequence.frames) for plan in self._plans)
         self._traverses: list[Traverse] = []
@@ -270,7 +270,7 @@ class TuningRun:
             )
             raster = read_truth([source.truth], class_map.place, self._truth)
             for note in raster.notes:
-                self._tell(f"note: {note}")
+                self._notify(f"note: {note}")
 
             def frames(plan: Plan = plan) -> Any:
                 nonlocal done
@@ -281,7 +281,7 @@ class TuningRun:
                     elif prepared.fault is not None and self._config.strict:
                         raise prepared.fault
                     else:
-                        self._tell(f"skipped {prepared.ref.name}: {prepared.fault}")
+                        self._notify(f"skipped {prepared.ref.name}: {prepared.fault}")
                     done += 1
                     advance(done)
 
@@ -329,7 +329,7 @@ class TuningRun:
             "jaxmap_version": jaxmap.__version__,
             "class": self._truth.target,
             "labeller": self._plans[0].labeller.name,
-            "traverses": self._told_traverses(),
+            "traverses": self._describe_traverses(),
             "before": plain(before),
             "stages": [stage.told for stage in stages],
             "notes": [note for stage in stages for note in descent_notes(stage.told)],
@@ -372,7 +372,7 @@ class TuningRun:
             told["calibration"][part] = {"before": calibration_rows(one), "after": calibration_rows(other)}
         return _Stage(after, told)
 
-    def _told_traverses(self) -> list[dict[str, Any]]:
+    def _describe_traverses(self) -> list[dict[str, Any]]:
         return [
             {
                 "sequence": plan.source,

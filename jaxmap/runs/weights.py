@@ -96,7 +96,7 @@ def convert_file(
     return imported
 
 
-def fetch(name: str, *, mirror: str | None = None, tell: Callable[[str], None] = lambda line: None) -> Path:
+def fetch(name: str, *, mirror: str | None = None, notify: Callable[[str], None] = lambda line: None) -> Path:
     """Downloads a file of the table into the cache, checks it, and returns where it lies.
 
     A file that is there and whole is not downloaded again.
@@ -104,7 +104,7 @@ def fetch(name: str, *, mirror: str | None = None, tell: Callable[[str], None] =
     Args:
         name: a key of `PUBLIC`.
         mirror: URL of a folder that holds the file under its own name, instead of the publisher's.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
 
     Raises:
         UsageError: an unknown name.
@@ -122,7 +122,7 @@ def fetch(name: str, *, mirror: str | None = None, tell: Callable[[str], None] =
     if target.is_file() and _is_whole(target, public):
         return target
     target.unlink(missing_ok=True)
-    tell(f"downloading {url}")
+    notify(f"downloading {url}")
     pooch.get_logger().setLevel("ERROR")
     try:
         pooch.retrieve(

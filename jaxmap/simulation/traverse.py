@@ -117,14 +117,14 @@ class Traverse:
 
 
 def simulate_traverse(
-    out: Path, options: TraverseOptions, tell: Callable[[str], None], advance: Callable[[int], None]
+    out: Path, options: TraverseOptions, notify: Callable[[str], None], advance: Callable[[int], None]
 ) -> float:
     """Records a traverse, or finishes one that was interrupted; frames that are there and whole are kept.
 
     Args:
         out: folder to write: `Part1` as the data set has it, and `gt` with all that is true of it.
         options: what decides it.
-        tell: takes lines for the user.
+        notify: takes lines for the user.
         advance: takes the number of frames done.
 
     Returns:
@@ -136,7 +136,7 @@ def simulate_traverse(
     claim_folder(out, {"options": asdict(options), "recipe": asdict(draw_world(options.seed, options.scene))})
     traverse = Traverse(options)
     world, lighting, renderer = traverse.build()
-    tell(f"{len(world.rocks)} rocks, {len(world.pebbles)} pebbles, {len(world.mesh.faces):,} triangles")
+    notify(f"{len(world.rocks)} rocks, {len(world.pebbles)} pebbles, {len(world.mesh.faces):,} triangles")
     _write_sequence_files(out, traverse, world)
     recorder = _Recorder(out, traverse, world, lighting, renderer)
     seconds = []

@@ -76,7 +76,7 @@ def test_a_run_that_was_cut_off_ends_with_the_same_members(run, scene_folder, cl
             folder,
             strict=False,
             checkpoint_every_s=0.0,
-            tell=lambda line: None,
+            notify=lambda line: None,
             on_frame=cut,
         )
     assert load_map(folder.map)[1].progress["next_index"] == 3

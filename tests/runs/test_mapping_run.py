@@ -286,7 +286,7 @@ def test_the_step_is_compiled_once_and_every_frame_told(scene_folder, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.begin(plan, config_of(), resume=False, overwrite=False)
     frames = []
-    run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, tell=lambda line: None, on_frame=frames.append)
+    run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=lambda line: None, on_frame=frames.append)
     assert [fused.prepared.index for fused in frames] == list(range(FRAMES))
     assert [fused.cost is not None for fused in frames] == [True] + [False] * (FRAMES - 1)
     # The run's step was compiled ahead of time; neither it nor the jitted one compiled again.

@@ -46,7 +46,7 @@ def run_until(sequence: Path, out: Path, index: int, checkpoint_every_s: float =
             folder,
             strict=False,
             checkpoint_every_s=checkpoint_every_s,
-            tell=lambda line: None,
+            notify=lambda line: None,
             on_frame=cut_after(index),
         )
 
@@ -89,7 +89,7 @@ def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
             folder,
             strict=False,
             checkpoint_every_s=0.0,
-            tell=lambda line: None,
+            notify=lambda line: None,
             on_frame=cut_after(4),
         )
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0

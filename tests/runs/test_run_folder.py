@@ -127,7 +127,7 @@ def test_an_interrupt_saves_what_is_there(scene_folder, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, tell=told.append, on_frame=interrupt)
+        run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=told.append, on_frame=interrupt)
     assert told[-1] == "interrupted and saved after 3 frames; --resume goes on there"
     assert folder.resume_point()[1].next_index == 3
 

@@ -155,7 +155,7 @@ def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(place):
     from jaxmap.runs.training_plan import load_train_config
 
     config = replace(load_train_config(str(place / "map.yaml")), ground_truth=place / "truth.tif")
-    plan = plan_map_training(str(place / "sequence"), config, place / "first.safetensors", tell=lambda line: None)
+    plan = plan_map_training(str(place / "sequence"), config, place / "first.safetensors", notify=lambda line: None)
     for index, kept in enumerate(plan.data.train):
         seen = scenes.scene_frame(index)
         known = kept.cells != IGNORE

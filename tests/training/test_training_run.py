@@ -71,7 +71,7 @@ def same_run(run: Path, whole: Path) -> None:
 
 
 def planned(data: Path) -> TrainingPlan:
-    return plan_training(data, load_train_config(str(data / "tiny.yaml")), None, tell=lambda line: None)
+    return plan_training(data, load_train_config(str(data / "tiny.yaml")), None, notify=lambda line: None)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def go(plan: TrainingPlan, out: Path, on_step: Callable[[int, str], None] = noth
     out.mkdir(exist_ok=True)
     folder = TrainingFolder(out)
     folder.begin(plan, resume=resume, overwrite=False)
-    TrainingRun(plan, folder, tell=lambda line: None, on_step=on_step).run()
+    TrainingRun(plan, folder, notify=lambda line: None, on_step=on_step).run()
 
 
 def run_until(plan: TrainingPlan, out: Path, step: int, *, resume: bool = False) -> None:
