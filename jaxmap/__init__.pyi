@@ -6,7 +6,8 @@ from .ensemble.options import EnsembleOptions
 from .errors import FrameError, JaxmapError, UsageError
 from .fusion.carve import carve
 from .fusion.integrate import integrate
-from .fusion.params import FusionParams, FusionRule, make_fusion_params
+from .fusion.options import FusionRule
+from .fusion.params import FusionParams, make_fusion_params
 from .fusion.query import TopDown, class_probabilities, occupancy_probability, top_down, voxel_labels
 from .geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
 from .geometry.grid import voxel_centres, world_to_voxel

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import top_down
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.labellers.files import make_files_labeller

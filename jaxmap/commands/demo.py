@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.runs.config import DepthConfig, MapConfig, load_config
+from jaxmap.geometry.options import DepthOptions
+from jaxmap.runs.config import MapConfig, load_config
 
 SAMPLE = "sample:traverse"
 TITLE = "A simulated traverse, mapped and scored"
@@ -43,7 +44,7 @@ def demo_rows() -> dict[str, tuple[str, str, MapConfig]]:
     for labeller in ("plane", "deeplab"):
         for preset in ("chiodini2020", "default"):
             config = MapConfig() if preset == "default" else load_config(preset)
-            config = replace(config, labeller=labeller, depth=DepthConfig(max_m=MAX_RANGE_M))
+            config = replace(config, labeller=labeller, depth=DepthOptions(max_m=MAX_RANGE_M))
             rows[f"{labeller}_{preset}"] = (labeller, preset, config)
     return rows
 

@@ -12,7 +12,7 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
-from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
+from jaxmap.runs.config import MapConfig, load_config
 
 OUTPUTS = (
     *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
@@ -50,7 +50,7 @@ class MapArguments:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(MapArguments, "map", words, with_config=_with_config)
-    config = check_config(config_tree(arguments.settings))
+    config = arguments.settings
     if arguments.resume and arguments.overwrite:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
     if not arguments.checkpoint_every_s >= 0:

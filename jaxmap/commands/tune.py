@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +13,8 @@ import tyro
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
 from jaxmap.host.output_folder import check_inputs_stay
-from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
+from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.tuning.options import TuneOptions
 
 
 @dataclass(frozen=True)
@@ -40,26 +41,7 @@ class TuneArguments:
     """Pose files, one for each sequence, where there are several (--poses for one)."""
     target: Annotated[str, tyro.conf.arg(name="class")] = "rock"
     """The class that is scored."""
-    steps: int = 150
-    """Steps of descent, at most."""
-    learning_rate: float = 0.05
-    """Of the descent; the least, if the loss diverges."""
-    patience: int = 40
-    """Stop after so many steps without a better held-out loss."""
-    class_weight: float = 1.0
-    """Weight of rock cells in the likelihood. Above 1 more rocks are found, and probabilities come out too high."""
-    iou_weight: float = 1.0
-    """Weight of 1 - soft IoU, beside the negative log-likelihood."""
-    held_out_share: float = 0.25
-    """Share of the ground that is held out, in blocks of 2 m and whole rocks."""
-    kernel: int = 0
-    """Learn a kernel of so many columns a side (3, 5, 7, 9) for each class in a second descent, and write it too."""
-    frozen: tuple[str, ...] = ()
-    """Names of parameters that stay as they are, such as disparity_sigma_px."""
-    cell_size_m: float = 0.2
-    """Edge of the cells that are scored."""
-    rock_fraction: float = 0.5
-    """A cell is rock where rock covers this share of it."""
+    options: Annotated[TuneOptions, tyro.conf.arg(name="")] = field(default_factory=TuneOptions)
     remap: tuple[str, ...] = ()
     """What the values of the orthomosaics mean: 0=unlabelled 7=rock '*=sand', or colours: '#b23c2e=rock'."""
     palette: Path | None = None
@@ -74,16 +56,14 @@ class TuneArguments:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(TuneArguments, "tune", words, with_config=_with_config)
-    config = check_config(config_tree(arguments.settings))
+    config = arguments.settings
     _check(arguments, config)
 
     from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.host.output_folder import locked
     from jaxmap.runs.evaluation import TruthOptions
-    from jaxmap.runs.tuning import Source, TuneOptions, TuningRun
-    from jaxmap.tuning.descent import DescentOptions
-    from jaxmap.tuning.map_loss import LossOptions
+    from jaxmap.runs.tuning import Source, TuningRun
 
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -96,15 +76,7 @@ def main(words: Sequence[str]) -> int:
         arguments.poses_of or (None,) * count,
         strict=True,
     )
-    options = TuneOptions(
-        DescentOptions(arguments.steps, arguments.learning_rate, arguments.patience),
-        LossOptions(1.0, arguments.iou_weight, arguments.class_weight, arguments.rock_fraction),
-        arguments.frozen,
-        arguments.cell_size_m,
-        arguments.held_out_share,
-        seed=config.seed,
-        kernel=arguments.kernel,
-    )
+    options = replace(arguments.options, seed=config.seed)
     run = TuningRun(
         [Source(*row) for row in rows],
         config,
@@ -116,7 +88,7 @@ def main(words: Sequence[str]) -> int:
     with locked(arguments.out.parent):
         with console.steps("reading", "frames", run.frames) as advance:
             run.cache(advance)
-        with console.steps("tuning", "steps", arguments.steps * (1 + bool(arguments.kernel))) as advance:
+        with console.steps("tuning", "steps", options.descent.steps * (1 + bool(options.kernel))) as advance:
             result = run.tune(advance)
     _print(console, result)
     for note in result["notes"]:

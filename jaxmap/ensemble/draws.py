@@ -126,7 +126,7 @@ def displaced(T_world_camera: jaxlie.SE3, error: Float[Array, "6"]) -> jaxlie.SE
     )
 
 
-def disparity_noise(key: PRNGKeyArray, shape: tuple[int, int], block_px: int) -> Float[Array, "H W"]:
+def disparity_noise(key: PRNGKeyArray, shape: tuple[int, ...], block_px: int) -> Float[Array, "H W"]:
     """Standard normal noise shared by the pixels of each block; where the blocks begin is drawn, too.
 
     Two pixels `dx` and `dy` apart are correlated by `(1 - dx / block) (1 - dy / block)`, those farther apart not.

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.query import top_down
 from jaxmap.types import VoxelMap
 

@@ -7,38 +7,39 @@ occupancy and the one class that is asked about, as no other decides whether a c
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxmap.ensemble.draws import EnsembleParams, MemberParams, disparity_noise, displaced
-from jaxmap.fusion.integrate import window_evidence
-from jaxmap.fusion.params import FusionRule
-from jaxmap.fusion.view import Reach, view_of
-from jaxmap.geometry.camera import disparity_to_points, transform_points
-from jaxmap.geometry.grid import Window
-from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap
+from jaxmap.fusion.carve import carve
+from jaxmap.fusion.integrate import count_points
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.sensor_model import frame_evidence, point_weights
+from jaxmap.geometry.camera import project
+from jaxmap.geometry.grid import view_window
+from jaxmap.types import Frame, PointLabels, StereoCamera, VoxelMap
 
 _LEAST_PROBABILITY = 1e-30
 _LEAST_REST = 1e-5
 
 
-class Site(NamedTuple):
-    """What all members share: the camera, the grid, and how they are fused."""
-
-    camera: StereoCamera
-    grid: GridSpec
-    rule: FusionRule
-    reach: Reach
-    class_count: int
-    target: int
-    """Index of the class that members carry."""
+_DRAW = 1
+"""Folded into a frame's key for the draws of the ensemble; the labeller draws from the key itself."""
 
 
 def fuse_members(
-    voxel_map: VoxelMap, frame: Frame, labels: PointLabels, site: Site, params: EnsembleParams, key: PRNGKeyArray
+    voxel_map: VoxelMap,
+    frame: Frame,
+    labels: PointLabels,
+    camera: StereoCamera,
+    params: EnsembleParams,
+    frame_key: PRNGKeyArray,
+    rule: FusionRule,
+    depth_range_m: tuple[float, float],
+    window_shape: tuple[int, int, int],
 ) -> Float[Array, "M 2 X Y Z"]:
     """Adds one frame to every member of a map.
 
@@ -46,19 +47,39 @@ def fuse_members(
         voxel_map: `members` are those so far.
         frame: with `pose_errors`, the errors of its pose.
         labels: of its pixels, as the map takes them.
-        site: what all members share.
+        camera: the rectified camera.
         params: the numbers of the members.
-        key: the frame's own; member `m` takes `fold_in(key, m)`.
+        frame_key: the frame's own; member `m` takes `fold_in(fold_in(frame_key, 1), m)`.
+        rule: how frames are fused; its first priority class is the one that members carry.
+        depth_range_m: the depths that are mapped.
+        window_shape: voxels that hold the view of a frame.
     """
     assert voxel_map.members is not None and frame.pose_errors is not None
-    count = voxel_map.members.shape[0]
+    target = rule.target(voxel_map.classes)
+    assert target is not None
+    key, index_of_class = jax.random.fold_in(frame_key, _DRAW), 1 + voxel_map.classes.index(target)
+    # Kept apart, so that the map comes out as it does without members.
+    frame, labels = jax.lax.optimization_barrier((frame, labels))
+    count, grid = voxel_map.members.shape[0], voxel_map.grid
     at_once = next(size for size in range(min(params.at_once, count), 0, -1) if count % size == 0)
     drawn = (jnp.arange(count), params.sensor, frame.pose_errors)
 
-    def evidence_of(number: Array, sensor: MemberParams, error: Array) -> tuple[Array, Array]:
-        member = _Member(sensor, error, jax.random.fold_in(key, number))
-        evidence, window = _member_evidence(frame, labels, site, params, member)
-        return evidence, window.start
+    def evidence_of(number: Array, sensor: MemberParams, pose_error: Array) -> tuple[Array, Array]:
+        """What a frame adds to one member, and where its window of the grid starts."""
+        noise = disparity_noise(jax.random.fold_in(key, number), frame.disparity_px.shape, params.block_px)
+        disparity_px = frame.disparity_px + params.disparity_sigma_px * noise
+        pose, fusion = displaced(frame.T_world_camera, pose_error), sensor.fusion
+
+        cloud = project(camera, pose, disparity_px, depth_range_m, fusion.disparity_sigma_px)
+        own = doubted(labels, sensor)._replace(keep=labels.keep & cloud.in_range.reshape(-1))
+        window = view_window(grid, camera, pose, depth_range_m[1], window_shape)
+        free = None
+        if rule.carve:
+            free = carve(camera, pose, cloud.depth_m, cloud.valid, grid, fusion, depth_range_m, window)
+        weights = point_weights(grid, cloud, rule)
+        counts = count_points(grid, cloud.points_world, own, weights, len(voxel_map.classes), window)
+        evidence = frame_evidence(counts, free, fusion, rule)
+        return jnp.stack([evidence[0], evidence[index_of_class]]), window.start
 
     def fuse_some(index: Int[Array, ""], members: Array) -> Array:
         some: Any = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, index * at_once, at_once), drawn)
@@ -77,41 +98,6 @@ def fuse_members(
 
     with jax.named_scope("fuse_members"):
         return jax.lax.fori_loop(0, count // at_once, fuse_some, voxel_map.members)
-
-
-class _Member(NamedTuple):
-    sensor: MemberParams
-    pose_error: Float[Array, "6"]
-    key: PRNGKeyArray
-
-
-def _member_evidence(
-    frame: Frame, labels: PointLabels, site: Site, params: EnsembleParams, member: _Member
-) -> tuple[Float[Array, "2 X Y Z"], Window]:
-    """What a frame adds to one member, and to which part of the grid."""
-    height_px, width_px = frame.disparity_px.shape
-    noise = disparity_noise(member.key, (height_px, width_px), params.block_px)
-    T_world_camera = displaced(frame.T_world_camera, member.pose_error)
-    points_camera, valid = disparity_to_points(site.camera, frame.disparity_px + params.disparity_sigma_px * noise)
-    depth_m = points_camera[..., 2]
-    low_m, high_m = site.reach.depth_range_m
-    in_range = valid & (depth_m >= low_m) & (depth_m <= high_m)
-    points_world = transform_points(T_world_camera, points_camera).reshape(-1, 3)
-    points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
-    view = view_of(site.grid, site.camera, T_world_camera, depth_m, valid, member.sensor.fusion, site.rule, site.reach)
-    own = doubted(labels, member.sensor)._replace(keep=labels.keep & in_range.reshape(-1))
-    evidence, _ = window_evidence(
-        site.grid,
-        points_world,
-        own,
-        view.weights,
-        site.class_count,
-        member.sensor.fusion,
-        site.rule,
-        view.window,
-        view.free,
-    )
-    return jnp.stack([evidence[0], evidence[1 + site.target]]), view.window
 
 
 def doubted(labels: PointLabels, member: MemberParams) -> PointLabels:

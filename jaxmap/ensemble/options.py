@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
-from annotated_types import Ge, Gt
+from jaxmap.host.settings import NotNegative, Positive, options
 
-Sigma = Annotated[float, Ge(0)]
+Sigma = Annotated[float, NotNegative]
 
 
-@dataclass(frozen=True)
+@options("ensemble")
 class EnsembleOptions:
-    """Members and their spread; the same record serves as a node of the configuration.
+    """Members and their spread. A standard deviation of 0 turns its error off."""
 
-    A standard deviation of 0 turns its error off.
-    """
-
-    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
-
-    members: Annotated[int, Ge(0)] = 0
+    members: Annotated[int, NotNegative] = 0
     """Maps beside the map, each made with errors of its own; 0 makes none. Each takes as much memory as the occupancy
     and one class of the map."""
     position_sigma_m: Sigma = 0.02
@@ -28,12 +22,12 @@ class EnsembleOptions:
     """Standard deviation of the heading."""
     tilt_sigma_rad: Sigma = 0.005
     """Standard deviation of roll and pitch, each."""
-    pose_correlation_s: Annotated[float, Gt(0)] = 10.0
+    pose_correlation_s: Annotated[float, Positive] = 10.0
     """Time over which errors of the pose last: much longer than the drive, they are offsets; far below the time
     between frames, they are noise."""
     disparity_sigma_px: Sigma = 0.25
     """Standard deviation of the disparity."""
-    disparity_block_px: Annotated[int, Gt(0)] = 16
+    disparity_block_px: Annotated[int, Positive] = 16
     """Edge of the blocks whose pixels share their error of disparity, as neighbours do that were matched together."""
     increment_sigma: Sigma = 0.3
     """Relative standard deviation (log-normal) of what each label, a hit and a miss add to the log-odds."""
@@ -41,5 +35,5 @@ class EnsembleOptions:
     """Relative standard deviation (log-normal) of the temperature of soft labels."""
     label_bias_sigma: Sigma = 1.0
     """Standard deviation of what is added to the logits of each class of soft labels, the same for the whole drive."""
-    at_once: Annotated[int, Gt(0)] = 1
+    at_once: Annotated[int, Positive] = 1
     """Members computed together: faster on an accelerator, at the cost of memory. The result is the same."""

@@ -8,7 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.query import occupied, voxel_labels
 from jaxmap.labels import IGNORE
 from jaxmap.types import VoxelMap

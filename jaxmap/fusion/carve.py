@@ -40,7 +40,8 @@ def carve(
         depth_range_m: nearer and farther voxels are left alone.
         window: the part of the grid that is asked about; all of it if not given.
     """
-    with jax.named_scope("carve"):
+
+    def look_up() -> Bool[Array, "X Y Z"]:
         centres_camera = transform_points(T_world_camera.inverse(), voxel_centres(grid, window))
         u_px, v_px, _, in_front = points_to_pixels(camera, centres_camera)
         height, width = depth_m.shape
@@ -55,3 +56,9 @@ def carve(
         seen_through = voxel_depth_m + margin_m < measured_m
         in_range = (voxel_depth_m >= depth_range_m[0]) & (voxel_depth_m <= depth_range_m[1])
         return in_view & seen_through & in_range
+
+    with jax.named_scope("carve"):
+        shape = grid.shape if window is None else window.grid.shape
+        # Nothing is fused across a conditional: as a part of what reads it, carving would be computed anew for each
+        # of its readers.
+        return jax.lax.cond(valid.any(), look_up, lambda: jnp.zeros(shape, bool))

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, total_weight
 from jaxmap.geometry.grid import Window, flat_voxel_index, whole_window
 from jaxmap.types import GridSpec, PointLabels, VoxelMap
@@ -46,33 +47,17 @@ def integrate(
     """
     if window is None:
         window = whole_window(voxel_map.grid)
-    evidence, weight = window_evidence(
-        voxel_map.grid, points_world, labels, weights, len(voxel_map.classes), params, rule, window, free
-    )
+    counts = count_points(voxel_map.grid, points_world, labels, weights, len(voxel_map.classes), window)
+    return add_evidence(voxel_map, frame_evidence(counts, free, params, rule), window), total_weight(counts)
+
+
+def add_evidence(voxel_map: VoxelMap, evidence: Float[Array, "C1 X Y Z"], window: Window) -> VoxelMap:
+    """Adds what a frame says of the voxels of a window to the map, and counts the frame."""
     with jax.named_scope("add_evidence"):
         corner = (jnp.zeros((), jnp.int32), *window.start)
         here = jax.lax.dynamic_slice(voxel_map.log_odds, corner, evidence.shape)
         log_odds = jax.lax.dynamic_update_slice(voxel_map.log_odds, here + evidence, corner)
-    fused = replace(voxel_map, log_odds=log_odds, frames_fused=voxel_map.frames_fused + 1)
-    return fused, weight
-
-
-def window_evidence(
-    grid: GridSpec,
-    points_world: Float[Array, "N 3"],
-    labels: PointLabels,
-    weights: Float[Array, "N"],
-    class_count: int,
-    params: FusionParams,
-    rule: FusionRule,
-    window: Window,
-    free: Bool[Array, "X Y Z"] | None,
-) -> tuple[Float[Array, "C1 X Y Z"], Float[Array, "X Y Z"]]:
-    """What one frame adds to the voxels of a window, and the weight of its points in each; see `integrate`."""
-    counts = count_points(grid, points_world, labels, weights, class_count, window)
-    # Kept apart: fused into the update of the map, XLA would compute carving anew for every channel.
-    counts, free = jax.lax.optimization_barrier((counts, free))
-    return frame_evidence(counts, free, params, rule), total_weight(counts)
+    return replace(voxel_map, log_odds=log_odds, frames_fused=voxel_map.frames_fused + 1)
 
 
 def count_points(

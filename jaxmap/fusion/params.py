@@ -1,215 +1,130 @@
-"""The numbers of the sensor model and of the decision, and the discrete choices beside them."""
+"""The numbers of the sensor model and of the decision, as the arrays that the step computes with."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.fusion.bijectors import between, own_label_above, positive, rings
+from jaxmap.fusion.options import FusionOptions, FusionRule
 from jaxmap.types import to_device
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FusionParams:
-    """The numbers of the sensor model and of the decision; every leaf is differentiable.
+    """The numbers of `FusionOptions` on the device; every leaf is differentiable.
 
-    Log-odds are natural. `class_increments[i, j]` is what one observation of label `i` adds to
-    class `j`. `disparity_sigma_px` drives the range weight and the margin of free-space carving.
-    `class_kernel`, one odd square a class, spreads evidence over neighbouring columns when the map is
-    read (`neighbours`); None for not at all.
+    Priors are log-odds here (natural), thresholds probabilities. `class_increments[i, j]` is what one observation of
+    label `i` adds to class `j`. `disparity_sigma_px` drives the range weight and the margin of free-space carving.
+    `class_kernel` spreads evidence over neighbouring columns when the map is read (`neighbours`); None for not at all.
+
+    Each tunable number is annotated with its bijector; the four of occupancy go together (`tuning.parametrisation`).
     """
 
     occupancy_hit: Float[Array, ""]
     occupancy_miss: Float[Array, ""]
     occupancy_prior: Float[Array, ""]
-    class_increments: Float[Array, "C C"]
-    class_prior: Float[Array, "C"]
-    disparity_sigma_px: Float[Array, ""]
-    full_evidence_points: Float[Array, ""]
+    class_increments: Annotated[Float[Array, "C C"], own_label_above()]
+    class_prior: Annotated[Float[Array, "C"], between(-7.0, 7.0)]
+    disparity_sigma_px: Annotated[Float[Array, ""], positive(1e-3, 50.0)]
+    full_evidence_points: Annotated[Float[Array, ""], positive(0.1, 1e4)]
     occupancy_threshold: Float[Array, ""]
-    class_threshold: Float[Array, ""]
-    class_kernel: Float[Array, "C K K"] | None = None
+    class_threshold: Annotated[Float[Array, ""], between(1e-3, 1.0 - 1e-3)]
+    class_kernel: Annotated[Float[Array, "C K K"] | None, rings(-0.5, 1.0)] = None
 
 
-@dataclass(frozen=True)
-class FusionRule:
-    """The discrete choices of fusion, fixed when the step is compiled.
-
-    Attributes:
-        per_frame: how the points of one frame in one voxel count. `sum`: each adds its increment;
-            `once`: each label present adds its increment once (the paper); `mean`: the frame adds
-            one increment, shared by the labels' fractions, in full from `full_evidence_points` on.
-        carve: whether voxels seen through are marked free.
-        range_weighting: whether a point counts less as its depth noise outgrows the voxel.
-        priority_classes: classes that win a voxel as soon as their probability passes the
-            threshold, in this order; the others compete by probability.
-        column: how voxels of a column make the top-down map: the `max` probability over them, or
-            the `sum` of their evidence.
-    """
-
-    per_frame: Literal["sum", "once", "mean"] = "mean"
-    carve: bool = True
-    range_weighting: bool = True
-    priority_classes: tuple[str, ...] = ("rock",)
-    column: Literal["max", "sum"] = "sum"
-
-    def target(self, classes: Sequence[str]) -> str | None:
-        """The class that cells are asked about first: the first priority class that is there."""
-        return next((name for name in self.priority_classes if name in classes), None)
-
-    def __post_init__(self) -> None:
-        """Refuses what no rule is called."""
-        for name, choices in (("per_frame", ("sum", "once", "mean")), ("column", ("max", "sum"))):
-            if getattr(self, name) not in choices:
-                raise JaxmapError(
-                    f"{name} is {getattr(self, name)!r}", where="fusion rule", fix=f"choose {', '.join(choices)}"
-                )
-
-
-def logit(probability: float) -> float:
-    """Natural log-odds of a probability in (0, 1)."""
-    return float(np.log(probability / (1.0 - probability)))
-
-
-def make_fusion_params(
-    classes: Sequence[str],
-    *,
-    occupancy_hit: float = 0.85,
-    occupancy_miss: float = -0.4,
-    occupancy_prior: float = 0.5,
-    class_hit: float = 0.9,
-    class_miss: float = -0.9,
-    class_increments: ArrayLike | None = None,
-    class_prior: ArrayLike = 0.5,
-    disparity_sigma_px: float = 0.5,
-    full_evidence_points: float = 8.0,
-    occupancy_threshold: float = 0.5,
-    class_threshold: float = 0.5,
-    class_kernel: ArrayLike | None = None,
-) -> FusionParams:
-    """Checks and builds `FusionParams`; priors and thresholds are probabilities here.
+def make_fusion_params(classes: Sequence[str], options: FusionOptions | None = None, **changes: Any) -> FusionParams:
+    """Builds `FusionParams` for a map of these classes.
 
     Without `class_increments`, an observation adds `class_hit` to its own class and `class_miss` to
     every other (the label confusion of a sensor that treats all classes alike).
 
-    Raises:
-        JaxmapError: a probability outside (0, 1), a matrix of another size, or a wrong sign.
-    """
-    count = len(classes)
-    numbers = dict(
-        occupancy_hit=occupancy_hit,
-        occupancy_miss=occupancy_miss,
-        class_hit=class_hit,
-        class_miss=class_miss,
-        disparity_sigma_px=disparity_sigma_px,
-        full_evidence_points=full_evidence_points,
-    )
-    for name, value in numbers.items():
-        if not np.isfinite(value):
-            raise JaxmapError(f"{name} is {value}", where="fusion", fix="give a finite number")
-    probabilities = dict(
-        occupancy_prior=occupancy_prior, occupancy_threshold=occupancy_threshold, class_threshold=class_threshold
-    )
-    for name, value in probabilities.items():
-        if not 0.0 < value < 1.0:
-            raise JaxmapError(f"{name} is {value}", where="fusion", fix="give a probability between 0 and 1")
-    if occupancy_hit < 0 or occupancy_miss > 0:
-        raise JaxmapError(
-            f"occupancy_hit {occupancy_hit} and occupancy_miss {occupancy_miss}",
-            where="fusion",
-            fix="a hit adds (>= 0) and a miss takes away (<= 0)",
-        )
-    if disparity_sigma_px <= 0 or full_evidence_points <= 0:
-        raise JaxmapError(
-            "disparity_sigma_px and full_evidence_points must be positive", where="fusion", fix="give numbers above 0"
-        )
-    matrix = _increment_matrix(count, class_hit, class_miss, class_increments)
-    priors = np.asarray(class_prior, np.float64)
-    if priors.shape not in ((), (count,)) or not ((priors > 0) & (priors < 1)).all():
-        raise JaxmapError(
-            f"class_prior is {class_prior}",
-            where="fusion",
-            fix="give probabilities between 0 and 1, one or one per class",
-        )
-    priors = np.broadcast_to(priors, (count,))
-
-    def leaf(value: ArrayLike) -> Array:
-        return to_device(value, np.float32)
-
-    return FusionParams(
-        occupancy_hit=leaf(occupancy_hit),
-        occupancy_miss=leaf(occupancy_miss),
-        occupancy_prior=leaf(logit(occupancy_prior)),
-        class_increments=leaf(matrix),
-        class_prior=leaf(np.log(priors / (1 - priors))),
-        disparity_sigma_px=leaf(disparity_sigma_px),
-        full_evidence_points=leaf(full_evidence_points),
-        occupancy_threshold=leaf(occupancy_threshold),
-        class_threshold=leaf(class_threshold),
-        class_kernel=None if class_kernel is None else leaf(_kernels(count, class_kernel)),
-    )
-
-
-def stored_fusion(fusion: Mapping[str, Any], classes: Sequence[str], where: object) -> tuple[FusionParams, FusionRule]:
-    """The parameters and the rule that a map was fused with, from its `fusion` attribute.
-
     Args:
-        fusion: `params`, the arguments of `make_fusion_params`, and `rule`, those of `FusionRule`; what
-            is absent is the default.
-        classes: the map's classes.
-        where: the map, for the error.
+        classes: of the map.
+        options: the numbers; by default those of `FusionOptions`.
+        **changes: fields of `FusionOptions` that differ from it.
 
     Raises:
-        JaxmapError: the attribute is not of this form, or holds what this version does not know.
+        JaxmapError: a number out of bounds, or a matrix, prior or kernel of another size than the classes ask for.
     """
-    try:
-        rule: dict[str, Any] = dict(fusion.get("rule", {}))
-        # JSON knows no tuples.
-        rule = {name: tuple(value) if isinstance(value, list) else value for name, value in rule.items()}
-        return make_fusion_params(classes, **fusion.get("params", {})), FusionRule(**rule)
-    except (TypeError, ValueError, AttributeError) as error:
+    numbers = replace(options or FusionOptions(), **changes)
+    count = len(classes)
+    priors = np.asarray(numbers.class_prior, np.float64)
+    if priors.shape not in ((), (count,)):
         raise JaxmapError(
-            f"the attribute fusion is not understood ({error})", where=where, fix="map the sequence again"
-        ) from error
-
-
-def _increment_matrix(
-    count: int, class_hit: float, class_miss: float, class_increments: ArrayLike | None
-) -> np.ndarray:
-    """What each label adds to each class, float64 (count, count)."""
-    if class_increments is None:
-        return np.full((count, count), class_miss) + np.eye(count) * (class_hit - class_miss)
-    try:
-        matrix = np.asarray(class_increments, np.float64)
-    except ValueError:
-        matrix = np.full((), np.nan)
-    if matrix.shape != (count, count) or not np.isfinite(matrix).all():
-        raise JaxmapError(
-            f"class_increments is not a finite {count}x{count} matrix",
-            where="fusion",
-            fix="give one row per observed label and one column per class",
+            f"class_prior is {numbers.class_prior}", where="fusion", fix="give one probability, or one per class"
         )
-    return matrix
-
-
-def _kernels(count: int, class_kernel: ArrayLike) -> np.ndarray:
-    """One square of odd size for each class, float64 (count, K, K)."""
-    try:
-        kernels = np.asarray(class_kernel, np.float64)
-    except ValueError:
-        kernels = np.zeros((0, 0, 0))
-    odd = kernels.ndim == 3 and len({*kernels.shape[1:]}) == 1 and kernels.shape[-1] % 2 == 1
-    if not odd or len(kernels) != count or not np.isfinite(kernels).all():
+    increments = np.full((count, count), numbers.class_miss) + np.eye(count) * (numbers.class_hit - numbers.class_miss)
+    if numbers.class_increments is not None:
+        increments = _array(numbers.class_increments)
+        if increments.shape != (count, count):
+            raise JaxmapError(
+                f"class_increments is not a finite {count}x{count} matrix",
+                where="fusion",
+                fix="give one row per observed label and one column per class",
+            )
+    kernel = None if numbers.class_kernel is None else _array(numbers.class_kernel)
+    if kernel is not None and not (
+        kernel.ndim == 3 and len(kernel) == count and kernel.shape[1] == kernel.shape[2] and kernel.shape[1] % 2 == 1
+    ):
         raise JaxmapError(
             f"class_kernel is not {count} finite squares of one odd size",
             where="fusion",
             fix="give one kernel for each class, such as 3x3",
         )
-    return kernels
+    values = {one.name: getattr(numbers, one.name) for one in fields(FusionParams)} | {
+        "occupancy_prior": logit(numbers.occupancy_prior),
+        "class_increments": increments,
+        "class_prior": np.broadcast_to(logit(priors), (count,)),
+        "class_kernel": kernel,
+    }
+    leaves: dict[str, Any] = {name: to_device(value, np.float32) for name, value in values.items() if value is not None}
+    return FusionParams(**leaves)
+
+
+def logit(probability: Any) -> Any:
+    """Natural log-odds of probabilities in (0, 1), float64."""
+    return np.log(probability / (1.0 - probability))
+
+
+def _array(rows: Any) -> np.ndarray:
+    """Nested rows as an array, empty where they are ragged."""
+    try:
+        return np.asarray(rows, np.float64)
+    except ValueError:
+        return np.empty(0)
+
+
+def fusion_numbers(params: FusionParams) -> dict[str, np.ndarray]:
+    """The numbers of `FusionOptions` that make these parameters; the inverse of `make_fusion_params`."""
+    numbers = {one.name: getattr(params, one.name) for one in fields(params)}
+    for prior in ("occupancy_prior", "class_prior"):
+        numbers[prior] = jax.nn.sigmoid(numbers[prior])
+    return {name: np.asarray(value, np.float64) for name, value in numbers.items() if value is not None}
+
+
+def fusion_attribute(options: FusionOptions, rule: FusionRule) -> dict[str, Any]:
+    """What a stored map records of its fusion, as plain values."""
+    return {"params": options.numbers(), "rule": asdict(rule)}
+
+
+def stored_fusion(fusion: Mapping[str, Any], classes: Sequence[str], where: object) -> tuple[FusionParams, FusionRule]:
+    """The parameters and the rule that a map was fused with, from its attribute (`fusion_attribute`).
+
+    Raises:
+        JaxmapError: the attribute is not of this form, or holds what this version does not know.
+    """
+    try:
+        return make_fusion_params(classes, **fusion.get("params", {})), FusionRule(**fusion.get("rule", {}))
+    except UsageError as error:
+        reason = error.what
+    except (TypeError, ValueError, AttributeError) as error:
+        reason = str(error)
+    raise JaxmapError(f"the attribute fusion is not understood ({reason})", where=where, fix="map the sequence again")

@@ -1,4 +1,4 @@
-"""Reading a map: probabilities, one label per voxel, and the view from above."""
+"""Reading a map: probabilities, one label per voxel, and the top-down map."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxmap.fusion.neighbours import spread_evidence
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
 from jaxmap.geometry.grid import voxel_centres
 from jaxmap.labels import IGNORE
 from jaxmap.types import VoxelMap
 
 
 class TopDown(NamedTuple):
-    """A map seen from above, one cell per column of voxels; x is the first axis, y the second.
+    """The top-down map, one cell per column of voxels; x is the first axis, y the second.
 
     `probability` is that of each class, given that something is there; `height_m` is the centre of
     the highest occupied voxel (world z), NaN where there is none; `observed` says that a surface
@@ -67,7 +68,7 @@ def voxel_labels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) ->
 
 @partial(jax.jit, static_argnames="rule")
 def top_down(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> TopDown:
-    """The map seen from above.
+    """The top-down map.
 
     The class evidence of a column is the sum over its occupied voxels, or the greatest of them
     (`rule.column`), spread over neighbouring columns where there is a `class_kernel`; labels follow the rule of
@@ -102,7 +103,7 @@ def _decide(
 ) -> UInt8[Array, "*s"]:
     """One label for each cell, from its class log-odds (priors included)."""
     label = jnp.full(known.shape, IGNORE, jnp.uint8)
-    priority = [classes.index(name) for name in rule.priority_classes if name in classes]
+    priority = rule.priority(classes)
     others = jnp.array([index for index in range(len(classes)) if index not in priority], jnp.uint8)
     if others.size:
         evident = log_odds[others] > params.class_prior[others].reshape(-1, *[1] * known.ndim)

@@ -13,22 +13,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxmap.fusion.params import FusionParams, FusionRule
-from jaxmap.geometry.camera import depth_sigma
-from jaxmap.types import GridSpec, StereoCamera
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
+from jaxmap.geometry.camera import PointCloud
+from jaxmap.types import GridSpec
 
 _UNROLLED_CLASSES = 8
 
 
-def range_weight(
-    camera: StereoCamera, grid: GridSpec, depth_m: Float[Array, "*s"], params: FusionParams
-) -> Float[Array, "*s"]:
+def range_weight(grid: GridSpec, sigma_m: Float[Array, "*s"]) -> Float[Array, "*s"]:
     """How much a point counts: `1 / (1 + (sigma_Z / voxel)^2)`, from 1 near by to 0 far off.
 
     The voxel is the grid's mean edge; `sigma_Z` is the depth noise.
     """
-    ratio = depth_sigma(camera, depth_m, params.disparity_sigma_px) / grid.voxel_size_m.mean()
+    ratio = sigma_m / grid.voxel_size_m.mean()
     return 1.0 / (1.0 + ratio * ratio)
+
+
+def point_weights(grid: GridSpec, cloud: PointCloud, rule: FusionRule) -> Float[Array, "N"]:
+    """How much each point of a cloud counts under a rule: its range weight, or 1."""
+    if rule.range_weighting:
+        return range_weight(grid, cloud.sigma_m.reshape(-1))
+    return jnp.ones(cloud.depth_m.size, cloud.depth_m.dtype)
 
 
 def frame_evidence(
@@ -49,6 +55,8 @@ def frame_evidence(
     Returns:
         Channel 0 for occupancy, then one channel per class; exact zeros where nothing was seen.
     """
+    # Kept apart: fused into the update of the map, XLA would compute carving anew for every channel.
+    counts, free = jax.lax.optimization_barrier((counts, free))
     with jax.named_scope("frame_evidence"):
         points = total_weight(counts)
         if rule.per_frame == "sum":

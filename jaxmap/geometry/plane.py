@@ -6,12 +6,14 @@ Computer Vision and Image Understanding 78 (2000), 138-156.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from jaxmap.geometry.options import PlaneFitOptions
 from jaxmap.types import Plane
 
 _REFIT_ROUNDS = 5
@@ -28,13 +30,9 @@ def fit_plane_mlesac(
     valid: Bool[Array, "N"],
     *,
     up_hint: Float[Array, "3"],
-    sigma_m: Float[Array, ""] | float = 0.05,
-    outlier_range_m: Float[Array, ""] | float = 4.0,
-    max_tilt_rad: float = 0.6,
-    hypotheses: int = 256,
-    sample_points: int = 8192,
-    em_rounds: int = 3,
-    cost: Literal["mlesac", "msac"] = "mlesac",
+    sigma_m: Float[Array, ""] | float | None = None,
+    options: PlaneFitOptions | None = None,
+    **changes: Any,
 ) -> Plane:
     """Fits the plane that most points lie on.
 
@@ -49,40 +47,20 @@ def fit_plane_mlesac(
         points: any frame, metres; the plane comes out in the same frame.
         valid: which points are real.
         up_hint: unit vector that the normal shall agree with.
-        sigma_m: standard deviation of points on the plane, along its normal.
-        outlier_range_m: nu, the range over which outliers spread evenly.
-        max_tilt_rad: hypotheses whose normal leans further from `up_hint` are rejected: walls.
-        hypotheses: number of planes tried, each through three points.
-        sample_points: number of points, drawn evenly from the valid ones, that judge them.
-        em_rounds: rounds of expectation maximisation for gamma.
-        cost: the score of a hypothesis.
+        sigma_m: standard deviation of points on the plane, along its normal, where it is not that of the options: a
+            traced number, to be differentiated.
+        options: of the fit; by default those of `PlaneFitOptions`.
+        **changes: fields of `PlaneFitOptions` that differ from it.
 
     Returns:
         The plane; `found` is false where no hypothesis was acceptable, and the plane then is the
         one through the origin across `up_hint`.
     """
+    options = replace(options or PlaneFitOptions(), **changes)
+    sigma = options.sigma_m if sigma_m is None else sigma_m
     with jax.named_scope("mlesac"):
-        start = search_plane(
-            key,
-            points,
-            valid,
-            up_hint=up_hint,
-            sigma_m=sigma_m,
-            outlier_range_m=outlier_range_m,
-            max_tilt_rad=max_tilt_rad,
-            hypotheses=hypotheses,
-            sample_points=sample_points,
-            em_rounds=em_rounds,
-            cost=cost,
-        )
-        return refit_plane(
-            start,
-            up_hint=up_hint,
-            sigma_m=sigma_m,
-            outlier_range_m=outlier_range_m,
-            max_tilt_rad=max_tilt_rad,
-            em_rounds=em_rounds,
-        )
+        start = search_plane(key, points, valid, up_hint, sigma, options)
+        return refit_plane(start, up_hint, sigma, options)
 
 
 class PlaneStart(NamedTuple):
@@ -104,17 +82,12 @@ def search_plane(
     key: PRNGKeyArray,
     points: Float[Array, "N 3"],
     valid: Bool[Array, "N"],
-    *,
     up_hint: Float[Array, "3"],
     sigma_m: Float[Array, ""] | float,
-    outlier_range_m: Float[Array, ""] | float,
-    max_tilt_rad: float,
-    hypotheses: int,
-    sample_points: int,
-    em_rounds: int,
-    cost: Literal["mlesac", "msac"],
+    options: PlaneFitOptions,
 ) -> PlaneStart:
-    """The first half of `fit_plane_mlesac`, whose arguments it takes: the hypothesis that wins, not yet refitted."""
+    """The first half of `fit_plane_mlesac`: the hypothesis that wins, not yet refitted."""
+    sample_points, hypotheses, outlier_range_m = options.sample_points, options.hypotheses, options.outlier_range_m
     draw_key, triple_key = jax.random.split(key)
     sample, enough = _draw_valid(draw_key, points, valid, sample_points)
     # Centred: the moments of the refit lose no digits, however far the frame's origin is.
@@ -122,14 +95,14 @@ def search_plane(
     sample = sample - centre
     triples = jax.random.randint(triple_key, (hypotheses, 3), 0, sample_points)
     normals, offsets, proper = _planes_through(sample[triples], up_hint)
-    acceptable = proper & (normals @ up_hint >= jnp.cos(max_tilt_rad))
+    acceptable = proper & (normals @ up_hint >= jnp.cos(options.max_tilt_rad))
 
     def score(residuals: Array) -> Array:
-        if cost == "msac":
+        if options.cost == "msac":
             return jnp.minimum(residuals**2, (1.96 * sigma_m) ** 2).sum()
         # Computed once: the rounds of EM only weigh it anew.
         density = jax.lax.optimization_barrier(_inlier_density(residuals, sigma_m))
-        gamma = _mixing(density, outlier_range_m, em_rounds)
+        gamma = _mixing(density, outlier_range_m, options.em_rounds)
         return -jnp.log(gamma * density + (1.0 - gamma) / outlier_range_m).sum()
 
     residuals_m = normals @ sample.T + offsets[:, None]
@@ -144,16 +117,10 @@ def search_plane(
 
 
 def refit_plane(
-    start: PlaneStart,
-    *,
-    up_hint: Float[Array, "3"],
-    sigma_m: Float[Array, ""] | float,
-    outlier_range_m: Float[Array, ""] | float,
-    max_tilt_rad: float,
-    em_rounds: int,
+    start: PlaneStart, up_hint: Float[Array, "3"], sigma_m: Float[Array, ""] | float, options: PlaneFitOptions
 ) -> Plane:
     """The second half of `fit_plane_mlesac`, differentiable in `sigma_m`: least squares on inlier posteriors."""
-    mixture = (sigma_m, outlier_range_m, em_rounds)
+    mixture = (sigma_m, options.outlier_range_m, options.em_rounds)
     # Points all alike, as where nothing is valid, have a spread without directions: its eigenvectors have no gradient.
     sample = jnp.where(start.found, start.sample, _spread_points(start.sample.shape[0]))
     more = jnp.where(start.found, start.spread, _spread_points(start.spread.shape[0]))
@@ -161,10 +128,10 @@ def refit_plane(
     normal, offset, inliers = _refit(sample, first, jnp.where(start.found, start.offset_m, 0.0), up_hint, mixture)
     for _ in range(_POLISH_ROUNDS):
         density = _inlier_density(more @ normal + offset, sigma_m)
-        weights = _posterior(density, inliers, outlier_range_m) * (start.spread_valid | ~start.found)
+        weights = _posterior(density, inliers, options.outlier_range_m) * (start.spread_valid | ~start.found)
         normal, offset = _least_squares(more, weights, up_hint)
     # Points of a wall may turn the refitted plane over; the hypothesis is acceptable as it is.
-    upright = normal @ up_hint >= jnp.cos(max_tilt_rad)
+    upright = normal @ up_hint >= jnp.cos(options.max_tilt_rad)
     normal = jnp.where(upright, normal, start.normal)
     offset = jnp.where(upright, offset, start.offset_m)
     return Plane(
@@ -185,7 +152,7 @@ def _spread_points(count: int) -> Float[Array, "S 3"]:
 def plane_distance(plane: Plane, points: Float[Array, "*s 3"]) -> Float[Array, "*s"]:
     """Signed distance of points from a plane, in metres, positive on the side of the normal."""
     n = plane.normal
-    return n[0] * points[..., 0] + n[1] * points[..., 1] + n[2] * points[..., 2] + plane.offset_m
+    return n[..., 0] * points[..., 0] + n[..., 1] * points[..., 1] + n[..., 2] * points[..., 2] + plane.offset_m
 
 
 def _draw_valid(key: PRNGKeyArray, points: Array, valid: Array, count: int) -> tuple[Array, Array]:

@@ -1,97 +1,116 @@
-"""Labellers: what gives every point of a frame its class. All have one signature."""
+"""What every labeller is: per-point features, and the labels that a few tunable numbers make of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, Shaped
 
+from jaxmap.fusion.bijectors import Bijector
+from jaxmap.geometry.camera import PointCloud
 from jaxmap.labels import IGNORE
-from jaxmap.types import Frame, Plane, PointLabels
+from jaxmap.types import Frame, PointLabels
 
 Needs = Literal["image", "labels", "class_probabilities"]
 """The fields of `Frame` that a labeller may ask for."""
 
+Numbers = dict[str, Float[Array, ""]]
+"""The tunable numbers of a labeller, by the names of its options."""
 
-class Cues(NamedTuple):
-    """What a labeller's tuned numbers act on, point by point: computed once, however the numbers change.
+
+Pointwise = Callable[[Float[Array, "N D *w"]], tuple[Shaped[Array, "N *w"], ...]]
+"""A function that treats points alike, from their features along axis 1."""
+
+
+class PointFeatures(NamedTuple):
+    """Per-point features of a frame: they stay as they are, however the tunable numbers change.
 
     Attributes:
         keep: points to fuse.
-        values: numbers of each point, smooth enough to be averaged over neighbouring pixels of one voxel.
-        labels: class indices that no number changes, or None.
-        shared: a pytree of the whole frame.
+        map: applies a pointwise function to the features and gives its arrays (N,). The features need never be held
+            all at once.
+        of_frame: a pytree of the whole frame.
     """
 
     keep: Bool[Array, "N"]
-    values: Float[Array, "N D"]
-    labels: Int[Array, "N"] | None = None
-    shared: PyTree = ()
+    map: Callable[[Pointwise], tuple[Shaped[Array, "N"], ...]]
+    of_frame: PyTree = ()
 
 
-class TunableLabels(NamedTuple):
-    """A labeller in two parts, so that its numbers can be tuned without running it anew.
+class LabellerParams(NamedTuple):
+    """The numbers that labelling depends on; every leaf is differentiable.
 
-    Attributes:
-        numbers: the numbers by name, as the settings name them, scalars.
-        limits: the least and the greatest that each may become.
-        cues: `(frame, points_world, valid, params, key) -> Cues`.
-        probabilities: `(values (G, D), frame (G,), shared, numbers) -> (G, C)`, with `shared` stacked over frames and
-            `frame` the index of each row's; not called where cues are labels.
+    `weights` are those of a network, `numbers` may be tuned. They are handed to the step, not compiled into it.
     """
 
-    numbers: dict[str, float]
-    limits: dict[str, tuple[float, float]]
-    cues: Callable[[Frame, Float[Array, "N 3"], Bool[Array, "N"], PyTree, PRNGKeyArray], Cues]
-    probabilities: Callable[
-        [Float[Array, "G D"], Int[Array, "G"], PyTree, dict[str, Float[Array, ""]]], Float[Array, "G C"]
-    ]
+    weights: PyTree = ()
+    numbers: Numbers = {}  # noqa: RUF012
+
+
+NO_NUMBERS = LabellerParams()
 
 
 class Labeller(NamedTuple):
-    """A pure labelling function and what it needs.
+    """Pure functions that give each point of a frame its class, and what they need.
 
     Attributes:
-        name: as on the command line.
+        name: as on the command line, and the section of its options.
         classes: the classes of its labels, in their order; they become the map's.
         needs: the field of `Frame` that must be filled, or None.
-        label: `(frame, points_world (N, 3), valid (N,), params, key) -> (PointLabels, Plane | None)`.
-        params: the numbers that labelling depends on, a pytree whose leaves are differentiable; none
-            for most. They are handed to the step (`MapperParams.labeller`), not compiled into it.
-        tunable: the same labeller in two parts, for tuning.
+        features: `(frame, cloud, params, key) -> PointFeatures`.
+        label: `(values, estimate, numbers) -> arrays`, pointwise from features along axis 1: the probability of each
+            class where `soft`, else one array of class indices (`IGNORE` where unknown).
+        estimate: `(of_frame, numbers) -> estimate`, of the whole frame.
+        keep: `(values, estimate) -> (bool,)`, pointwise: which points the labeller fuses; None for all.
+        params: the first ones.
+        bijectors: of each tunable number.
+        soft: labels are probabilities, which the numbers change smoothly: they can be tuned.
     """
 
     name: str
     classes: tuple[str, ...]
     needs: Needs | None
-    label: Callable[
-        [Frame, Float[Array, "N 3"], Bool[Array, "N"], PyTree, PRNGKeyArray], tuple[PointLabels, Plane | None]
-    ]
-    params: PyTree = ()
-    tunable: TunableLabels | None = None
+    features: Callable[[Frame, PointCloud, LabellerParams, PRNGKeyArray], PointFeatures]
+    label: Callable[[Array, PyTree, Numbers], tuple[Array, ...]]
+    estimate: Callable[[PyTree, Numbers], PyTree] = lambda of_frame, numbers: of_frame
+    keep: Callable[[Array, PyTree], tuple[Array]] | None = None
+    params: LabellerParams = NO_NUMBERS
+    bijectors: Mapping[str, Bijector] = {}
+    soft: bool = False
+
+
+def label_points(
+    labeller: Labeller, frame: Frame, cloud: PointCloud, params: LabellerParams, key: PRNGKeyArray
+) -> tuple[PointLabels, PyTree]:
+    """Labels the points of a frame; also returns the labeller's estimate of the whole frame."""
+    features = labeller.features(frame, cloud, params, key)
+    estimate = labeller.estimate(features.of_frame, params.numbers)
+    keep = kept_points(labeller, features, estimate)
+    labels = features.map(lambda values: labeller.label(values, estimate, params.numbers))
+    if labeller.soft:
+        # They are never stored side by side: each scatter reads its own one.
+        return PointLabels(keep, probabilities=jnp.stack(labels, axis=-1)), estimate
+    return PointLabels(keep, labels=labels[0]), estimate
+
+
+def kept_points(labeller: Labeller, features: PointFeatures, estimate: PyTree) -> Bool[Array, "N"]:
+    """The points of a frame that are fused."""
+    choose = labeller.keep
+    return features.keep if choose is None else features.keep & features.map(lambda values: choose(values, estimate))[0]
 
 
 def make_no_labeller() -> Labeller:
     """Geometry alone: no class at all."""
 
-    def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:
-        return PointLabels(keep=valid, labels=jnp.full(valid.shape, IGNORE, jnp.int32)), None
+    def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
+        return PointFeatures(cloud.in_range.reshape(-1), lambda function: function(cloud.points_world))
 
-    return Labeller("none", (), None, label)
+    def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array]:
+        return (jnp.full(values.shape[:1], IGNORE, jnp.int32),)
 
-
-def fixed_labels(label: Callable[..., tuple[PointLabels, Plane | None]]) -> TunableLabels:
-    """A labeller without numbers to tune: what it says is all there is."""
-
-    def cues(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> Cues:
-        said, _ = label(frame, points_world, valid, params, key)
-        if said.probabilities is None:
-            return Cues(said.keep, jnp.zeros((valid.shape[0], 0)), labels=said.labels)
-        return Cues(said.keep, said.probabilities)
-
-    return TunableLabels({}, {}, cues, lambda values, frame, shared, numbers: values)
+    return Labeller("none", (), None, features, label)
 
 
 def harden(labels: PointLabels) -> PointLabels:

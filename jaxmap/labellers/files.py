@@ -8,19 +8,21 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmap.labellers.base import Labeller, Needs, fixed_labels
-from jaxmap.types import Frame, PointLabels
+from jaxmap.geometry.camera import PointCloud
+from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures
+from jaxmap.types import Frame
 
 
 def make_files_labeller(classes: Sequence[str], *, soft: bool) -> Labeller:
     """Labels made elsewhere, carried by the frame: class indices, or probabilities where `soft`."""
+    needs = "class_probabilities" if soft else "labels"
 
-    def label(frame: Frame, points_world: Array, valid: Array, params: Any, key: Array) -> tuple[PointLabels, None]:
-        if soft:
-            assert frame.class_probabilities is not None
-            return PointLabels(keep=valid, probabilities=frame.class_probabilities.reshape(-1, len(classes))), None
-        assert frame.labels is not None
-        return PointLabels(keep=valid, labels=frame.labels.reshape(-1).astype(jnp.int32)), None
+    def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
+        carried = getattr(frame, needs)
+        values = carried.reshape(carried.shape[0] * carried.shape[1], -1)
+        return PointFeatures(cloud.in_range.reshape(-1), lambda function: function(values))
 
-    needs: Needs = "class_probabilities" if soft else "labels"
-    return Labeller("files", tuple(classes), needs, label, tunable=fixed_labels(label))
+    def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
+        return tuple(values[:, c] for c in range(len(classes))) if soft else (values[:, 0].astype(jnp.int32),)
+
+    return Labeller("files", tuple(classes), needs, features, label, soft=soft)

@@ -20,7 +20,7 @@ from jaxmap.errors import FrameError
 from jaxmap.host.prefetch import prefetch
 from jaxmap.host.stages import timed_stage
 from jaxmap.labellers.base import Labeller, Needs
-from jaxmap.mapping.step import Mapper, MapperParams, StepCost, StepInfo, compile_step
+from jaxmap.mapping.step import Mapper, MapperParams, StepCost, StepReport, compile_step
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
 from jaxmap.types import Frame, StereoCamera, VoxelMap, to_device
 
@@ -48,7 +48,7 @@ class FusedFrame:
     """
 
     prepared: PreparedFrame
-    info: StepInfo | None = None
+    info: StepReport | None = None
     cost: StepCost | None = None
 
 

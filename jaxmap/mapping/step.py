@@ -14,25 +14,75 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from jaxmap.ensemble.draws import EnsembleParams
-from jaxmap.ensemble.members import Site, fuse_members
+from jaxmap.ensemble.members import fuse_members
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.integrate import integrate
-from jaxmap.fusion.params import FusionParams, FusionRule
-from jaxmap.fusion.view import Reach, view_of
-from jaxmap.geometry.camera import disparity_to_points, transform_points
-from jaxmap.geometry.grid import window_shape
-from jaxmap.labellers.base import Labeller, harden
+from jaxmap.fusion.carve import carve
+from jaxmap.fusion.integrate import add_evidence, count_points
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
+from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
+from jaxmap.geometry.camera import project
+from jaxmap.geometry.grid import view_window, window_shape
+from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, harden, label_points
 from jaxmap.labels import IGNORE
-from jaxmap.types import Frame, GridSpec, Plane, PointLabels, StereoCamera, VoxelMap, make_voxel_map
+from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MapperParams:
+    """All the numbers the step depends on; every leaf is differentiable.
+
+    `labeller` are `Labeller.params`, `ensemble` the numbers of an ensemble's members, where the mapper has any.
+    """
+
+    camera: StereoCamera
+    fusion: FusionParams
+    labeller: LabellerParams = NO_NUMBERS
+    ensemble: EnsembleParams | None = None
+
+
+class StepReport(NamedTuple):
+    """What one step did.
+
+    `points_valid` have a disparity, `points_in_range` lie between the depths, `points_kept` were
+    kept by the labeller; `voxels_hit` hold points, `voxels_freed` were seen through; `estimate` is
+    the labeller's, of the whole frame (the `Plane` of the plane labeller).
+    """
+
+    points_valid: Int[Array, ""]
+    points_in_range: Int[Array, ""]
+    points_kept: Int[Array, ""]
+    voxels_hit: Int[Array, ""]
+    voxels_freed: Int[Array, ""]
+    estimate: PyTree
+
+
+class StepDesign(NamedTuple):
+    """What is decided before the step is compiled.
+
+    Attributes:
+        labeller: gives each point its class.
+        rule: the discrete choices of fusion.
+        depth_range_m: points nearer or farther are left out.
+        window_shape: voxels of a part of the grid that holds all that a frame can touch.
+        members: of an ensemble that is fused beside the map.
+    """
+
+    labeller: Labeller
+    rule: FusionRule
+    depth_range_m: tuple[float, float]
+    window_shape: tuple[int, int, int]
+    members: int = 0
+
+
 def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """The same with products of matrices in full float32: a GPU by itself rounds the factors to ten bits.
 
-    Positions of many metres would be off by centimetres. A CPU computes them in full whatever it is told.
+    Positions of many metres would be off by centimetres. A CPU computes them in full in any case.
     """
 
     @functools.wraps(function)
@@ -43,37 +93,57 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
     return exact
 
 
-_ENSEMBLE_DRAW = 1
-"""Folded into a frame's key for the draws of the ensemble; the labeller draws from the key itself."""
+@in_full_float32
+def fuse_frame(
+    design: StepDesign, voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray
+) -> tuple[VoxelMap, StepReport]:
+    """The step itself: one frame into the map. `key` is the run's."""
+    labeller, rule, depth_range_m, shape, members = design
+    grid, camera, pose, fusion = voxel_map.grid, params.camera, frame.T_world_camera, params.fusion
+    frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
+
+    cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px)
+    labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
+    labels = harden(labels) if rule.per_frame == "once" else labels
+    window = view_window(grid, camera, pose, depth_range_m[1], shape)
+    free = None
+    if rule.carve:
+        free = carve(camera, pose, cloud.depth_m, cloud.valid, grid, fusion, depth_range_m, window)
+    weights = point_weights(grid, cloud, rule)
+    counts = count_points(grid, cloud.points_world, labels, weights, len(voxel_map.classes), window)
+    fused = add_evidence(voxel_map, frame_evidence(counts, free, fusion, rule), window)
+    if members:
+        assert params.ensemble is not None
+        own = fuse_members(voxel_map, frame, labels, camera, params.ensemble, frame_key, rule, depth_range_m, shape)
+        fused = replace(fused, members=own)
+
+    hits = total_weight(counts) > 0
+    report = StepReport(
+        points_valid=cloud.valid.sum(),
+        points_in_range=cloud.in_range.sum(),
+        points_kept=labels.keep.sum(),
+        voxels_hit=hits.sum(),
+        voxels_freed=jnp.zeros((), jnp.int32) if free is None else (free & ~hits).sum(),
+        estimate=estimate,
+    )
+    return fused, report
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class MapperParams:
-    """All the numbers the step depends on; every leaf is differentiable."""
+@in_full_float32
+def label_image(
+    design: StepDesign, frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]
+) -> UInt8[Array, "H W"]:
+    """The labels that the step gives the pixels of the frame when `number` frames were fused before it."""
+    frame_key = jax.random.fold_in(key, number)
+    cloud = project(
+        params.camera, frame.T_world_camera, frame.disparity_px, design.depth_range_m, params.fusion.disparity_sigma_px
+    )
+    labels = harden(label_points(design.labeller, frame, cloud, params.labeller, frame_key)[0])
+    assert labels.labels is not None
+    return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(frame.disparity_px.shape)
 
-    camera: StereoCamera
-    fusion: FusionParams
-    labeller: PyTree = ()
-    """`Labeller.params`; most labellers have none."""
-    ensemble: EnsembleParams | None = None
-    """The numbers of an ensemble's members, where the mapper has any."""
 
-
-class StepInfo(NamedTuple):
-    """What one step did.
-
-    `points_valid` have a disparity, `points_in_range` lie between the depths, `points_kept` were
-    kept by the labeller; `voxels_hit` hold points, `voxels_freed` were seen through; `plane` is the
-    labeller's, or None.
-    """
-
-    points_valid: Int[Array, ""]
-    points_in_range: Int[Array, ""]
-    points_kept: Int[Array, ""]
-    voxels_hit: Int[Array, ""]
-    voxels_freed: Int[Array, ""]
-    plane: Plane | None
+Step = Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepReport]]
 
 
 class Mapper(NamedTuple):
@@ -81,11 +151,11 @@ class Mapper(NamedTuple):
 
     Attributes:
         init: `() -> VoxelMap`, an empty map.
-        step: `(voxel_map, frame, params, key) -> (voxel_map, StepInfo)`, compiled once; the map
+        step: `(voxel_map, frame, params, key) -> (voxel_map, StepReport)`, compiled once; the map
             passed in is donated: its tensor must not be used again. The key is the run's: the step folds
             the number of fused frames into it.
         fuse: the same function, not jitted and donating nothing, to be composed and differentiated.
-        scan: `(voxel_map, frames, params, key) -> (voxel_map, StepInfo)` over frames stacked along
+        scan: `(voxel_map, frames, params, key) -> (voxel_map, StepReport)` over frames stacked along
             a leading axis, equal to a loop over `step`.
         label_image: `(frame, params, key, number) -> uint8 (H, W)`, the labels that the step gives
             the pixels of the frame when `number` frames were fused before it; `IGNORE` where none.
@@ -94,9 +164,9 @@ class Mapper(NamedTuple):
     """
 
     init: Callable[[], VoxelMap]
-    step: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepInfo]]
-    fuse: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepInfo]]
-    scan: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepInfo]]
+    step: Step
+    fuse: Step
+    scan: Step
     label_image: Callable[[Frame, MapperParams, PRNGKeyArray, int], UInt8[Array, "H W"]]
     lower: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], jax.stages.Lowered]
     compilations: Callable[[], int]
@@ -127,41 +197,46 @@ def make_mapper(
             than these need. What a frame of another pose sees beyond its window is left out.
 
     Raises:
-        JaxmapError: a depth range that is none, or an ensemble without a class to ask about.
+        JaxmapError: an invalid depth range, or an ensemble without a class to ask about; when a step is traced, a
+            frame or params that lack what it needs.
     """
     min_depth_m, max_depth_m = depth_range_m
     if not 0 <= min_depth_m < max_depth_m < float("inf"):
-        raise JaxmapError(f"depth range {min_depth_m} to {max_depth_m} m", where="mapper", fix="take 0 <= min < max")
+        raise JaxmapError(
+            f"invalid depth range {min_depth_m} to {max_depth_m} m", where="mapper", fix="take 0 <= min < max"
+        )
     if members and rule.target(labeller.classes) is None:
         raise JaxmapError(
-            "an ensemble needs a class whose misses it tells", where="mapper", fix="name one in priority_classes"
+            "an ensemble needs a class whose misses it estimates", where="mapper", fix="name one in priority_classes"
         )
-    reach = Reach(depth_range_m, window_shape(grid, camera, max_depth_m, T_world_camera))
-    design = _Design(labeller, rule, reach, members)
-    fuse = functools.partial(_fuse, design)
+    shape = window_shape(grid, camera, max_depth_m, T_world_camera)
+    design = StepDesign(labeller, rule, depth_range_m, shape, members)
 
-    def scan(voxel_map: VoxelMap, frames: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
+    def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepReport]:
+        _check_inputs(design, frame, params)
+        return fuse_frame(design, voxel_map, frame, params, key)
+
+    def scan(
+        voxel_map: VoxelMap, frames: Frame, params: MapperParams, key: PRNGKeyArray
+    ) -> tuple[VoxelMap, StepReport]:
         return jax.lax.scan(lambda carried, frame: fuse(carried, frame, params, key), voxel_map, frames)
 
-    def fuse_donated(tensors: _Tensors, rest: VoxelMap, *inputs: Any) -> tuple[VoxelMap, StepInfo]:
+    def label(frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]) -> UInt8[Array, "H W"]:
+        _check_inputs(design, frame, params)
+        return label_image(design, frame, params, key, number)
+
+    def fuse_donated(tensors: _Tensors, rest: VoxelMap, *inputs: Any) -> tuple[VoxelMap, StepReport]:
         return fuse(replace(rest, **tensors._asdict()), *inputs)
 
     # Only the tensors are donated: the small arrays of the grid may be shared with other maps.
     compiled: Any = jax.jit(fuse_donated, donate_argnums=0)
-
-    def step(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
-        return compiled(*_apart(voxel_map), frame, params, key)
-
-    def lower(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> jax.stages.Lowered:
-        return compiled.lower(*_apart(voxel_map), frame, params, key)
-
     return Mapper(
         init=lambda: make_voxel_map(grid, labeller.classes, members),
-        step=step,
+        step=lambda voxel_map, *inputs: compiled(*_apart(voxel_map), *inputs),
         fuse=fuse,
         scan=jax.jit(scan),
-        label_image=jax.jit(functools.partial(_label_image, design)),
-        lower=lower,
+        label_image=jax.jit(label),
+        lower=lambda voxel_map, *inputs: compiled.lower(*_apart(voxel_map), *inputs),
         compilations=compiled._cache_size,
     )
 
@@ -187,120 +262,28 @@ def compile_step(
     executable = mapper.lower(voxel_map, frame, params, key).compile()
     compile_s = time.perf_counter() - started_s
     memory = executable.memory_analysis()
-
-    def step(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepInfo]:
-        return executable(*_apart(voxel_map), frame, params, key)
-
-    return mapper._replace(step=step), StepCost(
-        compile_s, memory.temp_size_in_bytes if memory else 0, executable.as_text
-    )
+    cost = StepCost(compile_s, memory.temp_size_in_bytes if memory else 0, executable.as_text)
+    return mapper._replace(step=lambda voxel_map, *inputs: executable(*_apart(voxel_map), *inputs)), cost
 
 
-class _Design(NamedTuple):
-    """What is decided before the step is compiled."""
-
-    labeller: Labeller
-    rule: FusionRule
-    reach: Reach
-    members: int
-
-
-class _Observation(NamedTuple):
-    """The labelled points of one frame; images are (H, W), lists (H W)."""
-
-    depth_m: Array
-    valid: Array
-    in_range: Array
-    points_world: Array
-    labels: PointLabels
-    plane: Plane | None
-
-
-@in_full_float32
-def _observe(design: _Design, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> _Observation:
-    """The labelled points of a frame; `key` is the frame's own."""
+def _check_inputs(design: StepDesign, frame: Frame, params: MapperParams) -> None:
+    """Refuses a frame or params that lack what the step needs."""
     labeller = design.labeller
+    where = f"{labeller.name} labeller"
     if labeller.needs is not None and getattr(frame, labeller.needs) is None:
-        raise JaxmapError(
-            f"the frame has no {labeller.needs}", where=f"{labeller.name} labeller", fix="fill that field of Frame"
-        )
+        raise JaxmapError(f"the frame has no {labeller.needs}", where=where, fix="fill that field of Frame")
     if jax.tree.structure(params.labeller) != jax.tree.structure(labeller.params):
         raise JaxmapError(
             "the params hold other numbers than the labeller's",
-            where=f"{labeller.name} labeller",
+            where=where,
             fix="build MapperParams with labeller=labeller.params",
         )
-    min_depth_m, max_depth_m = design.reach.depth_range_m
-    points_camera, valid = disparity_to_points(params.camera, frame.disparity_px)
-    depth_m = points_camera[..., 2]
-    in_range = valid & (depth_m >= min_depth_m) & (depth_m <= max_depth_m)
-    points_world = transform_points(frame.T_world_camera, points_camera).reshape(-1, 3)
-    # Kept apart: labeller and scatter would each compute the points anew, one by one.
-    points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
-    labels, plane = labeller.label(frame, points_world, in_range.reshape(-1), params.labeller, key)
-    return _Observation(depth_m, valid, in_range, points_world, labels, plane)
-
-
-@in_full_float32
-def _fuse(
-    design: _Design, voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray
-) -> tuple[VoxelMap, StepInfo]:
-    """The step itself: one frame into the map."""
-    rule, grid = design.rule, voxel_map.grid
-    frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
-    seen = _observe(design, frame, params, frame_key)
-    labels = harden(seen.labels) if rule.per_frame == "once" else seen.labels
-    view = view_of(
-        grid, params.camera, frame.T_world_camera, seen.depth_m, seen.valid, params.fusion, rule, design.reach
-    )
-    fused, hits = integrate(
-        voxel_map, seen.points_world, labels, view.weights, params.fusion, rule, window=view.window, free=view.free
-    )
-    if design.members:
-        fused = replace(fused, members=_fuse_ensemble(design, voxel_map, frame, labels, params, frame_key))
-    free = view.free
-    info = StepInfo(
-        points_valid=seen.valid.sum(),
-        points_in_range=seen.in_range.sum(),
-        points_kept=labels.keep.sum(),
-        voxels_hit=(hits > 0).sum(),
-        voxels_freed=(free & (hits == 0)).sum() if free is not None else jnp.zeros((), jnp.int32),
-        plane=seen.plane,
-    )
-    return fused, info
-
-
-def _fuse_ensemble(
-    design: _Design,
-    voxel_map: VoxelMap,
-    frame: Frame,
-    labels: PointLabels,
-    params: MapperParams,
-    frame_key: PRNGKeyArray,
-) -> Array:
-    """The members of the ensemble, with the frame in each."""
-    if params.ensemble is None or frame.pose_errors is None:
+    if design.members and (params.ensemble is None or frame.pose_errors is None):
         raise JaxmapError(
             "the ensemble has no numbers to draw by",
             where="mapper",
             fix="fill MapperParams.ensemble and Frame.pose_errors",
         )
-    classes, target = design.labeller.classes, design.rule.target(design.labeller.classes)
-    assert target is not None
-    site = Site(params.camera, voxel_map.grid, design.rule, design.reach, len(classes), classes.index(target))
-    # Kept apart, so that the map comes out as it does without members.
-    frame, labels = jax.lax.optimization_barrier((frame, labels))
-    return fuse_members(voxel_map, frame, labels, site, params.ensemble, jax.random.fold_in(frame_key, _ENSEMBLE_DRAW))
-
-
-def _label_image(
-    design: _Design, frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]
-) -> UInt8[Array, "H W"]:
-    """See `Mapper.label_image`."""
-    labels = harden(_observe(design, frame, params, jax.random.fold_in(key, number)).labels)
-    assert labels.labels is not None
-    hard = jnp.where(labels.keep, labels.labels, IGNORE)
-    return hard.astype(jnp.uint8).reshape(frame.disparity_px.shape)
 
 
 class _Tensors(NamedTuple):

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.mapping.store import MapAttributes, load_map
 from jaxmap.types import VoxelMap
 

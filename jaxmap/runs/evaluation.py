@@ -24,7 +24,8 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.evaluate import ClassMap, Evaluation, ScoringOptions, evaluate_map
 from jaxmap.evaluation.truth_cells import PixelCorners, pixel_corners, sample_between
 from jaxmap.evaluation.views import Views
-from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import top_down
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.store import load_map

@@ -19,7 +19,8 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.export.geotiff import write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
-from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
 from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml

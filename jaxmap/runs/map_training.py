@@ -19,11 +19,10 @@ from jaxmap.datasets.orthomosaic import read_label_orthomosaic
 from jaxmap.errors import JaxmapError, UsageError, options_as, with_options
 from jaxmap.evaluation.cells import CellGrid
 from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
-from jaxmap.geometry.camera import disparity_to_points, transform_points
+from jaxmap.geometry.camera import project
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.files import bundled
 from jaxmap.host.prefetch import prefetch
-from jaxmap.labellers.deeplab import DeeplabParams
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import MapperParams
@@ -40,8 +39,9 @@ from jaxmap.training.starts import make_start
 from jaxmap.training.validation import SHOWN as MOST_SHOWN
 from jaxmap.training.validation import Shown, Validation
 from jaxmap.tuning.frame_crops import FrameBatch
-from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth
+from jaxmap.tuning.map_loss import MapTruth, make_map_truth
 from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
+from jaxmap.tuning.options import MapLossOptions
 from jaxmap.types import Frame, VoxelMap
 
 
@@ -191,7 +191,6 @@ class MapValidator:
         """
         data, plan = self._data, self._data.plan
         labelling = plan.params.labeller
-        assert isinstance(labelling, DeeplabParams)
         labelling = labelling._replace(weights=self._fold(weights))
         params = MapperParams(plan.params.camera, plan.params.fusion, labelling)
         voxel_map, shown = plan.mapper.init(), []
@@ -404,11 +403,10 @@ def keep_frames(
 
 def cells_of_pixels(frame: Frame, plan: Plan, truth: CellTruth) -> UInt8[np.ndarray, "H W"]:
     """The class of the cell that each pixel's point lies in; `IGNORE` where there is none."""
-    points_camera, valid = disparity_to_points(plan.front_end.camera, frame.disparity_px)
-    points_world = np.asarray(transform_points(frame.T_world_camera, points_camera))
-    depth_m, (least_m, most_m) = np.asarray(points_camera[..., 2]), plan.depth_range_m
-    used = np.asarray(valid) & (depth_m >= least_m) & (depth_m <= most_m)
-    return np.where(used, truth.of_points(points_world), np.uint8(IGNORE))
+    sigma_px = plan.params.fusion.disparity_sigma_px
+    cloud = project(plan.front_end.camera, frame.T_world_camera, frame.disparity_px, plan.depth_range_m, sigma_px)
+    points_world = np.asarray(cloud.points_world).reshape(*frame.disparity_px.shape, 3)
+    return np.where(np.asarray(cloud.in_range), truth.of_points(points_world), np.uint8(IGNORE))
 
 
 def _split(
@@ -444,15 +442,15 @@ def _check_shown(counts: np.ndarray, data: MapData, config: TrainConfig) -> None
     )
 
 
-def _losses(config: TrainConfig, counts: np.ndarray, shown: Iterable[int]) -> dict[int, LossOptions]:
+def _losses(config: TrainConfig, counts: np.ndarray, shown: Iterable[int]) -> dict[int, MapLossOptions]:
     """The loss of each class against the rest, from the settings of losses of pixels."""
     weights = class_weights(config.loss, counts)
     losses = {}
     for index in shown:
         others = [weights[other] for other in shown if other != index]
-        losses[index] = LossOptions(
-            nll=config.loss.cross_entropy,
-            soft_iou=config.loss.soft_iou,
+        losses[index] = MapLossOptions(
+            nll_weight=config.loss.cross_entropy,
+            iou_weight=config.loss.soft_iou,
             class_weight=float(weights[index] / np.mean(others)),
         )
     return losses

@@ -18,8 +18,10 @@ from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.ensemble.draws import draw_ensemble
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import fusion_attribute, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
+from jaxmap.geometry.options import GridOptions, Triple
 from jaxmap.host.files import bundled
 from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
@@ -30,7 +32,7 @@ from jaxmap.mapping.sequence import frame_form
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.tensor_files import shortened
-from jaxmap.runs.config import GridConfig, MapConfig, Triple, split_fusion
+from jaxmap.runs.config import MapConfig
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import Frame, GridSpec, StereoCamera, make_grid
@@ -66,7 +68,7 @@ def choose_grid(
 
 
 def _grid_of(
-    settings: GridConfig,
+    settings: GridOptions,
     voxel_size_m: float | Triple,
     sequence: StereoSequence,
     front_end: StereoFrontEnd,
@@ -195,12 +197,12 @@ def choose_labeller(config: MapConfig, label_folder: LabelFolder | None, network
     if classes is not None and len(set(classes)) < len(classes):
         raise UsageError(f"a class is named twice: {' '.join(classes)}", fix="give each class once")
     if network is not None:
-        return make_deeplab_labeller(network, classes, **asdict(config.deeplab))
+        return make_deeplab_labeller(network, classes, config.deeplab)
     classes = ROVER_CLASSES if classes is None else classes
     if label_folder is not None:
         return make_files_labeller(classes, soft=label_folder.soft)
     if config.labeller == "plane":
-        return make_plane_labeller(classes, **asdict(config.plane))
+        return make_plane_labeller(classes, config.plane)
     return make_no_labeller()
 
 
@@ -295,10 +297,9 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         if model is not None and network is not None:
             notify(describe_network(model, network, labeller.classes))
         grid = choose_grid(config, sequence, front_end, depth_range_m[1], len(labeller.classes))
-        params, rule = split_fusion(config.fusion, labeller.classes)
-        fusion_rule = FusionRule(**rule)
-        fusion_params = make_fusion_params(labeller.classes, **params)
-        members = _members(config, fusion_rule, labeller.classes)
+        rule = config.fusion.rule(labeller.classes)
+        fusion_params = make_fusion_params(labeller.classes, config.fusion)
+        members = _members(config, rule, labeller.classes)
     notify(describe_grid(grid, depth_range_m, len(labeller.classes), members))
     check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
     key = jax.random.key(config.seed)
@@ -316,14 +317,14 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         model=model,
         grid=grid,
         depth_range_m=depth_range_m,
-        rule=fusion_rule,
+        rule=rule,
         params=MapperParams(camera, fusion_params, labeller.params, ensemble),
-        fusion={"params": params, "rule": rule} | ({"ensemble": asdict(config.ensemble)} if members else {}),
+        fusion=fusion_attribute(config.fusion, rule) | ({"ensemble": asdict(config.ensemble)} if members else {}),
         mapper=make_mapper(
             camera,
             grid,
             labeller,
-            fusion_rule,
+            rule,
             depth_range_m,
             members=members,
             # The members of an ensemble stand elsewhere.

@@ -14,11 +14,12 @@ from annotated_types import Ge, Gt, Interval
 from pydantic import BeforeValidator
 
 from jaxmap.errors import UsageError
+from jaxmap.geometry.options import GridOptions
 from jaxmap.host.settings import Settings
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import load_model
 from jaxmap.models.deeplab import Weights
-from jaxmap.runs.config import GridConfig, LabellerName, MapConfig
+from jaxmap.runs.config import LabellerName, MapConfig
 from jaxmap.training.batches import Order, Pixels, batches_from
 from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set
 from jaxmap.training.losses import class_weights
@@ -73,7 +74,7 @@ class TaughtMapping(MapConfig):
 
     labeller: LabellerName = "deeplab"
     """Only deeplab means something here."""
-    grid: GridConfig = field(default_factory=lambda: GridConfig(voxel_size_m=(0.1, 0.1, 0.2)))
+    grid: GridOptions = field(default_factory=lambda: GridOptions(voxel_size_m=(0.1, 0.1, 0.2)))
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,18 +13,19 @@ import numpy as np
 
 import jaxmap
 from jaxmap.errors import UsageError
+from jaxmap.fusion.params import fusion_numbers
 from jaxmap.host.files import atomic_path, remove
 from jaxmap.host.output_folder import write_json, write_yaml
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.report.tuning_page import tuning_page
-from jaxmap.runs.config import MapConfig, check_config, config_tree
+from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
 from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
-from jaxmap.tuning.descent import DescentOptions, Step, descend
-from jaxmap.tuning.evidence_cache import BLOCK_PX, CacheRecipe, build_cache, tunable_labels
-from jaxmap.tuning.map_loss import LossOptions
-from jaxmap.tuning.parametrisation import TunedParams, to_free, to_legal
+from jaxmap.tuning.descent import Step, descend
+from jaxmap.tuning.evidence_cache import CacheRecipe, build_cache, tunable_numbers
+from jaxmap.tuning.options import TuneOptions
+from jaxmap.tuning.parametrisation import TunedParams, constrained, unconstrained
 from jaxmap.tuning.traverse_loss import (
     Traverse,
     TraverseArrays,
@@ -35,100 +35,42 @@ from jaxmap.tuning.traverse_loss import (
     traverse_losses,
 )
 
+SOFT_START_M = 0.03
+"""Where the width of the plane's threshold starts when the settings have a sharp one, which nothing can move."""
+
 _DATA = ("labels", "labels_are", "poses", "poses_world", "calibration", "start", "stop", "stride")
 """Settings that are of the data tuned on, and not of how they are mapped."""
 
-_SECTION = {
-    "temperature": "deeplab",
-    "sigma_m": "plane",
-    "threshold_m": "plane",
-    "softness_m": "plane",
-}
-"""The section that holds each number of a labeller."""
 
-
-def tuned_tree(config: MapConfig, params: TunedParams) -> dict[str, Any]:
-    """The settings with the tuned parameters in them, and without what is of the data alone.
+def tuned_config(config: MapConfig, params: TunedParams) -> MapConfig:
+    """The settings with the tuned parameters in them.
 
     Args:
         config: how the traverses were mapped.
         params: what came out.
 
     Raises:
-        UsageError: a parameter is none that the settings accept; the parametrisation rules that out.
+        UsageError: a parameter is none that the settings accept; the bijectors rule that out.
     """
-    tree = {name: value for name, value in config_tree(config).items() if name not in _DATA and value is not None}
-    fusion, sigmoid = params.fusion, jax.nn.sigmoid
-    tree["fusion"] = tree["fusion"] | {
-        "occupancy_hit": _plain(fusion.occupancy_hit),
-        "occupancy_miss": _plain(fusion.occupancy_miss),
-        "occupancy_prior": _plain(sigmoid(fusion.occupancy_prior)),
-        "class_increments": _plain(fusion.class_increments),
-        "class_prior": _plain(sigmoid(fusion.class_prior)),
-        "disparity_sigma_px": _plain(fusion.disparity_sigma_px),
-        "full_evidence_points": _plain(fusion.full_evidence_points),
-        "occupancy_threshold": _plain(fusion.occupancy_threshold),
-        "class_threshold": _plain(fusion.class_threshold),
-    }
-    if fusion.class_kernel is not None:
-        tree["fusion"]["class_kernel"] = _plain(fusion.class_kernel)
-    for name, value in params.labeller.items():
-        tree[_SECTION[name]] = tree[_SECTION[name]] | {name: _plain(value)}
-    check_config(tree, "the tuned configuration")
-    return tree
+    fusion = {name: _rounded(value) for name, value in fusion_numbers(params.fusion).items()}
+    config = replace(config, fusion=replace(config.fusion, **fusion))
+    if params.labeller:
+        numbers = {name: _rounded(value) for name, value in params.labeller.items()}
+        section = config.labeller
+        config = replace(config, **{section: replace(getattr(config, section), **numbers)})
+    return config
 
 
-def _plain(value: Any) -> Any:
+def mapping_tree(config: MapConfig) -> dict[str, Any]:
+    """The settings as plain values, without what is of the data alone."""
+    return {name: value for name, value in config_tree(config).items() if name not in _DATA and value is not None}
+
+
+def _rounded(value: Any) -> Any:
     """Numbers to six digits, as lists where there are several."""
     array = np.asarray(value, np.float64)
     rounded = np.array([float(f"{number:.6g}") for number in array.ravel()]).reshape(array.shape)
     return rounded.tolist()
-
-
-MAX_KERNEL = 9
-
-
-@dataclass(frozen=True)
-class TuneOptions:
-    """How fusion is tuned.
-
-    Attributes:
-        descent: of the gradient.
-        loss: what is descended.
-        frozen: names of parameters that stay as they are.
-        cell_size_m: edge of the cells that are scored.
-        held_out_share: of the ground, kept from the descent and used to stop it.
-        block_px: see `evidence_cache.BLOCK_PX`.
-        seed: of what is held out, and of the bootstrap.
-        kernel: size of a kernel over neighbouring columns, learnt in a second descent; 0 for none.
-    """
-
-    descent: DescentOptions = field(default_factory=DescentOptions)
-    loss: LossOptions = field(default_factory=LossOptions)
-    frozen: tuple[str, ...] = ()
-    cell_size_m: float = 0.2
-    held_out_share: float = 0.25
-    block_px: int = BLOCK_PX
-    seed: int = 0
-    kernel: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuses what makes no sense."""
-        if self.kernel and (self.kernel % 2 == 0 or not 3 <= self.kernel <= MAX_KERNEL):
-            raise UsageError(f"kernel is {self.kernel}", where="tuning", fix=f"give an odd size from 3 to {MAX_KERNEL}")
-        if not 0 < self.held_out_share < 1:
-            raise UsageError(
-                f"held_out_share is {self.held_out_share}", where="tuning", fix="give a share between 0 and 1"
-            )
-        if not 0 < self.loss.rock_fraction <= 1:
-            raise UsageError(
-                f"rock_fraction is {self.loss.rock_fraction}", where="tuning", fix="give a share above 0, at most 1"
-            )
-        for name, value in (("class_weight", self.loss.class_weight), ("cell_size_m", self.cell_size_m)):
-            if not 0 < value < math.inf:
-                raise UsageError(f"{name} is {value}", where="tuning", fix="give a number above 0")
-        if not 0 <= self.loss.soft_iou < math.inf:
-            raise UsageError(f"iou_weight is {self.loss.soft_iou}", where="tuning", fix="give a number from 0 on")
 
 
 @dataclass(frozen=True)
@@ -148,12 +90,14 @@ class TuningPlan(NamedTuple):
         config: the settings, with what the first sequence has decided.
         mappings: how each sequence is mapped.
         target: index of the class that is scored.
-        start: the parameters that tuning starts from.
+        before: the parameters of the settings.
+        start: those that tuning starts from: of a sharp plane, a soft one.
     """
 
     config: MapConfig
     mappings: tuple[Plan, ...]
     target: int
+    before: TunedParams
     start: TunedParams
 
 
@@ -173,6 +117,10 @@ def plan_tuning(
         JaxmapError: a sequence cannot be opened, or the settings do not serve.
         UsageError: the map has no such class, or no such parameter that is to be frozen.
     """
+    sharp = config.labeller == "plane" and config.plane.softness_m == 0
+    if sharp:
+        # A sharp threshold passes no gradient.
+        config = replace(config, plane=replace(config.plane, softness_m=SOFT_START_M))
     mappings: list[Plan] = []
     for source in sources:
         mine = replace(config, labels=source.labels or config.labels, poses=source.poses or config.poses)
@@ -187,16 +135,15 @@ def plan_tuning(
             where="--class",
             fix="name one of them, or choose another --labeller",
         )
-    start = _start(mappings[0])
+    start = TunedParams(mappings[0].params.fusion, tunable_numbers(mappings[0].labeller, mappings[0].rule))
     names = plain(start)
     if unknown := [name for name in options.frozen if name not in names]:
         raise UsageError(f"no parameter {', '.join(unknown)}", where="--frozen", fix=f"name some of {' '.join(names)}")
-    return TuningPlan(config, tuple(mappings), classes.index(target), start)
-
-
-def _start(plan: Plan) -> TunedParams:
-    numbers = tunable_labels(plan.labeller, plan.rule).numbers
-    return TunedParams(plan.params.fusion, {name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()})
+    before = start
+    if sharp and start.labeller:
+        # Widths are divided by: one so narrow makes no difference to a sharp threshold.
+        before = start._replace(labeller=start.labeller | {"softness_m": jnp.asarray(1e-5)})
+    return TuningPlan(config, tuple(mappings), classes.index(target), before, start)
 
 
 def _decided(config: MapConfig, plan: Plan) -> MapConfig:
@@ -216,10 +163,6 @@ def plain(params: TunedParams) -> dict[str, Any]:
     return {
         name: np.asarray(value, np.float64).round(6).tolist() for name, value in values.items() if value is not None
     }
-
-
-SOFT_START_M = 0.03
-"""Where the width of the plane's threshold starts when the settings have a sharp one, which nothing can move."""
 
 
 class TuningRun:
@@ -247,7 +190,7 @@ class TuningRun:
         self._truth, self._options, self._out, self._notify = truth, options, out, notify
         self._sources = sources
         plan = plan_tuning(sources, config, truth.target, options, notify)
-        self._config, self._plans, self._target, self._start = plan
+        self._config, self._plans, self._target, self._before, self._start = plan
         self.frames = sum(len(plan.sequence.frames) for plan in self._plans)
         self._traverses: list[Traverse] = []
 
@@ -309,10 +252,8 @@ class TuningRun:
         Raises:
             JaxmapError: the loss diverges, or writing failed; what was best before is kept.
         """
-        before = start = self._start
-        if start.labeller.get("softness_m") == 0.0:
-            start = start._replace(labeller=start.labeller | {"softness_m": jnp.asarray(SOFT_START_M)})
-        stages = [self._stage("tuned", before, start, advance)]
+        before = self._before
+        stages = [self._stage("tuned", before, self._start, advance)]
         if self._options.kernel:
             start = stages[-1].params
             middle = np.zeros((self._options.kernel,) * 2)
@@ -331,8 +272,8 @@ class TuningRun:
             "labeller": self._plans[0].labeller.name,
             "traverses": self._describe_traverses(),
             "before": plain(before),
-            "stages": [stage.told for stage in stages],
-            "notes": [note for stage in stages for note in descent_notes(stage.told)],
+            "stages": [stage.record for stage in stages],
+            "notes": [note for stage in stages for note in descent_notes(stage.record)],
         }
         write_json(self._out.with_suffix(".json"), result)
         with atomic_path(self._out.with_suffix(".html")) as temporary:
@@ -340,37 +281,40 @@ class TuningRun:
         return result
 
     def _stage(self, name: str, before: TunedParams, start: TunedParams, advance: Callable[[int, str], None]) -> _Stage:
-        """One descent from `start`, the best so far written at every step; told beside `before`."""
-        limits = tunable_labels(self._plans[0].labeller, self._plans[0].rule).limits
-        free = to_free(start, limits)
+        """One descent from `start`, the best so far written at every step; reported beside `before`."""
+        bijectors = self._plans[0].labeller.bijectors
+        free = unconstrained(start, bijectors)
         history: list[dict[str, float]] = []
 
         def loss(free: TunedParams, arrays: list[TraverseArrays]) -> tuple[jax.Array, jax.Array]:
-            legal = to_legal(free, limits)
+            params = constrained(free, bijectors)
             traverses = [replace(one, arrays=mine) for one, mine in zip(self._traverses, arrays, strict=True)]
-            both = [traverse_losses(one, legal, self._target, self._options.loss) for one in traverses]
+            both = [traverse_losses(one, params, self._target, self._options.loss) for one in traverses]
             tuned = jnp.stack([tuned for (tuned, _), _ in both]).mean()
             return tuned, jnp.stack([held for _, (held, _) in both]).mean()
 
         def on_step(step: Step) -> None:
             history.append({"step": step.number, "loss": step.losses.tuned, "held_out": step.losses.held_out})
             if step.best:
-                self._write_config(to_legal(step.free, limits))
+                self._write_config(constrained(step.free, bijectors))
             advance(step.number, f"loss {step.losses.tuned:.4f}, held out {step.losses.held_out:.4f}")
 
         data = ([one.arrays for one in self._traverses],)
         best = descend(loss, free, self._options.descent, data=data, moves=self._moves(free), on_step=on_step)
-        after = to_legal(best.free, limits)
-        told: dict[str, Any] = {"name": name, "best_step": best.number, "parameters": plain(after), "history": history}
-        told |= {"scores": {}, "calibration": {}}
-        old, new = (
-            [score_cells(one, params, self._target) for one in self._traverses] for params in (_hard(before), after)
-        )
+        after = constrained(best.free, bijectors)
+        record: dict[str, Any] = {
+            "name": name,
+            "best_step": best.number,
+            "parameters": plain(after),
+            "history": history,
+        }
+        record |= {"history": history, "scores": {}, "calibration": {}}
+        old, new = ([score_cells(one, params, self._target) for one in self._traverses] for params in (before, after))
         for part, wanted in (("held_out", True), ("tuned_on", False)):
             one, other = (self._part(cells, wanted) for cells in (old, new))
-            told["scores"][part] = score_with_intervals(one, other, seed=self._options.seed)
-            told["calibration"][part] = {"before": calibration_rows(one), "after": calibration_rows(other)}
-        return _Stage(after, told)
+            record["scores"][part] = score_with_intervals(one, other, seed=self._options.seed)
+            record["calibration"][part] = {"before": calibration_rows(one), "after": calibration_rows(other)}
+        return _Stage(after, record)
 
     def _describe_traverses(self) -> list[dict[str, Any]]:
         return [
@@ -398,7 +342,7 @@ class TuningRun:
         # Scores and page of an earlier run are of other numbers; those of this one come at its end.
         for suffix in (".json", ".html"):
             remove(self._out.with_suffix(suffix))
-        write_yaml(self._out, tuned_tree(self._config, params))
+        write_yaml(self._out, mapping_tree(tuned_config(self._config, params)))
 
     def _part(self, cells: list[ScoredCells], held_out: bool) -> ScoredCells:
         """Of the cells of all traverses, those that are held out, or those tuned on."""
@@ -410,10 +354,10 @@ class TuningRun:
 
 
 class _Stage(NamedTuple):
-    """What a descent came to, and what is told of it."""
+    """The parameters that a descent reached, and its record."""
 
     params: TunedParams
-    told: dict[str, Any]
+    record: dict[str, Any]
 
 
 def descent_notes(stage: Mapping[str, Any]) -> list[str]:
@@ -434,10 +378,3 @@ def descent_notes(stage: Mapping[str, Any]) -> list[str]:
         f"{stage['name']}: nothing better than the start was found on the held-out ground, whose numbers are kept; "
         f"{course}{advice}"
     ]
-
-
-def _hard(params: TunedParams) -> TunedParams:
-    """A sharp threshold as one so narrow that it makes no difference: widths are divided by."""
-    if params.labeller.get("softness_m") == 0.0:
-        return params._replace(labeller=params.labeller | {"softness_m": jnp.asarray(1e-5)})
-    return params

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -12,33 +11,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import PyTree
 
-from jaxmap.errors import JaxmapError, UsageError
-
-
-@dataclass(frozen=True)
-class DescentOptions:
-    """How the descent goes.
-
-    Attributes:
-        steps: at most.
-        learning_rate: of Adam, in units of the free numbers; it falls to zero along a half cosine.
-        patience: steps without a better held-out loss after which it stops.
-        max_norm: gradients are shortened to this length.
-    """
-
-    steps: int = 150
-    learning_rate: float = 0.05
-    patience: int = 40
-    max_norm: float = 10.0
-
-    def __post_init__(self) -> None:
-        """Refuses what makes no sense."""
-        for name in ("steps", "patience"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"{name} is {getattr(self, name)}", where="tuning", fix="give a number above 0")
-        for name in ("learning_rate", "max_norm"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise UsageError(f"{name} is {getattr(self, name)}", where="tuning", fix="give a number above 0")
+from jaxmap.errors import JaxmapError
+from jaxmap.tuning.options import DescentOptions
 
 
 class Losses(NamedTuple):

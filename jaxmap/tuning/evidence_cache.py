@@ -1,9 +1,10 @@
 """The evidence of a sequence's frames, computed once: an epoch of tuning is then a gather and a scatter.
 
-Disparities, the network and the projection do not depend on what is tuned. Of each frame only this is kept: the cues
-of its points that fell into the grid (`labellers.Cues`), their depth and voxel, and which voxels it saw through. Points
-of one frame that share a voxel and a block of pixels are kept as one, with their mean cue and depth and their number.
-Only voxels that some frame hit are kept at all: the view from above shows no others.
+Disparities, the network and the projection do not depend on what is tuned. Of each frame only this is kept: the
+features of its points that fell into the grid (`labellers.base.PointFeatures`), their depth and voxel, and which voxels
+it saw through. Points of one frame that share a voxel and a block of pixels are kept as one, with their mean features
+and depth and their number. Where no number changes the labels smoothly, the features are the labels, a share for each
+class. Only voxels that some frame hit are kept at all: the top-down map shows no others.
 
 Which points fall into which voxel, and which voxels a frame saw through, is decided at the parameters that the cache is
 made with: the margin of carving moves with `disparity_sigma_px` in a map, and does not here.
@@ -22,24 +23,22 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.carve import carve
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, range_weight
-from jaxmap.geometry.camera import disparity_to_points, transform_points
+from jaxmap.geometry.camera import depth_sigma, project
 from jaxmap.geometry.grid import flat_voxel_index, view_window, whole_window, window_shape
-from jaxmap.labellers.base import Labeller, TunableLabels, fixed_labels, harden
+from jaxmap.labellers.base import Labeller, Numbers, harden, kept_points, label_points
 from jaxmap.mapping.step import MapperParams
+from jaxmap.tuning.options import BLOCK_PX
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
-
-BLOCK_PX = 4
-"""Points this near in the image, and in one voxel, are kept as one; 1 keeps every point."""
 
 
 class EvidenceCache(NamedTuple):
     """The kept points G of F frames, in P pairs of frame and voxel, over V voxels.
 
     Attributes:
-        values: mean cue of each kept point.
-        labels: its class where no number changes it, or None; -1 for none.
+        values: mean features of each kept point.
         depth_m: mean depth.
         points: how many points it stands for.
         frame: index of its frame.
@@ -47,11 +46,10 @@ class EvidenceCache(NamedTuple):
         voxel_of_pair: index of each pair's voxel among the V.
         freed: how many frames saw through each voxel without a point in it.
         voxel: flat index of each voxel in the grid, row-major.
-        shared: what the labeller keeps of whole frames, stacked.
+        of_frame: features of whole frames, stacked.
     """
 
     values: Float[Array, "G D"]
-    labels: Int[Array, "G"] | None
     depth_m: Float[Array, "G"]
     points: Float[Array, "G"]
     frame: Int[Array, "G"]
@@ -59,7 +57,7 @@ class EvidenceCache(NamedTuple):
     voxel_of_pair: Int[Array, "P"]
     freed: Float[Array, "V"]
     voxel: Int[Array, "V"]
-    shared: PyTree
+    of_frame: PyTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +77,6 @@ class _Kept(NamedTuple):
     voxel: np.ndarray
     depth_m: np.ndarray
     points: np.ndarray
-    labels: np.ndarray | None
     values: np.ndarray
 
 
@@ -107,51 +104,59 @@ def build_cache(
         raise JaxmapError("the labeller gives no classes", where="tuning", fix="choose another --labeller")
     observe = _observer(recipe)
     freed = np.zeros(int(np.prod(recipe.grid.shape)), np.int32)
-    kept, shared = [], []
+    kept, of_frames = [], []
     for number, frame in enumerate(frames):
         seen = observe(frame, params, jax.random.fold_in(key, number))
         kept.append(_thinned(jax.tree.map(np.asarray, seen), frame.disparity_px.shape, block_px))
-        shared.append(seen["shared"])
+        of_frames.append(seen["of_frame"])
         if recipe.rule.carve:
             _count_freed(freed, np.asarray(seen["free"]), np.asarray(seen["start"]), recipe.grid.shape, kept[-1].voxel)
     if not sum(len(one.voxel) for one in kept):
         raise JaxmapError("no frame has a point in the grid", where="tuning", fix="check poses, bounds and range")
-    return _joined(kept, shared, freed)
+    return _joined(kept, of_frames, freed)
 
 
-def tunable_labels(labeller: Labeller, rule: FusionRule) -> TunableLabels:
-    """The labeller in two parts; where the rule counts hard labels, no number of it changes them smoothly."""
-    if rule.per_frame == "once":
-        return fixed_labels(lambda *inputs: (harden(labeller.label(*inputs)[0]), None))
-    return labeller.tunable or fixed_labels(labeller.label)
+def tunable_numbers(labeller: Labeller, rule: FusionRule) -> Numbers:
+    """The numbers of the labeller that change its labels smoothly: none where labels, or the rule, are hard."""
+    return labeller.params.numbers if _is_soft(labeller, rule) else {}
+
+
+def _is_soft(labeller: Labeller, rule: FusionRule) -> bool:
+    return labeller.soft and rule.per_frame != "once"
 
 
 def _observer(recipe: CacheRecipe) -> Any:
-    """The compiled front of the mapper: where the points of a frame lie, and their cues."""
-    low_m, high_m = recipe.depth_range_m
-    size = window_shape(recipe.grid, recipe.camera, high_m)
-    tunable = tunable_labels(recipe.labeller, recipe.rule)
+    """The compiled front of the mapper: where the points of a frame lie, and their features."""
+    max_depth_m = recipe.depth_range_m[1]
+    size = window_shape(recipe.grid, recipe.camera, max_depth_m)
+    labeller, classes = recipe.labeller, len(recipe.labeller.classes)
 
     @jax.jit
     def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> dict[str, Any]:
-        points_camera, valid = disparity_to_points(params.camera, frame.disparity_px)
-        depth_m = points_camera[..., 2]
-        in_range = valid & (depth_m >= low_m) & (depth_m <= high_m)
-        points_world = transform_points(frame.T_world_camera, points_camera).reshape(-1, 3)
-        cues = tunable.cues(frame, points_world, in_range.reshape(-1), params.labeller, key)
-        window = view_window(recipe.grid, params.camera, frame.T_world_camera, high_m, size)
+        pose, fusion = frame.T_world_camera, params.fusion
+        cloud = project(params.camera, pose, frame.disparity_px, recipe.depth_range_m, fusion.disparity_sigma_px)
+        features = labeller.features(frame, cloud, params.labeller, key)
+        estimate = labeller.estimate(features.of_frame, params.labeller.numbers)
+        keep, of_frame = kept_points(labeller, features, estimate), features.of_frame
+        if _is_soft(labeller, recipe.rule):
+            values = jnp.stack(features.map(lambda values: tuple(jnp.moveaxis(values, 1, 0))), axis=-1)
+        else:
+            hard = harden(label_points(labeller, frame, cloud, params.labeller, key)[0]).labels
+            assert hard is not None
+            values, of_frame = (hard[:, None] == jnp.arange(classes)).astype(jnp.float32), ()
+        window = view_window(recipe.grid, params.camera, pose, max_depth_m, size)
         free = None
         if recipe.rule.carve:
-            pose = frame.T_world_camera
-            free = carve(params.camera, pose, depth_m, valid, recipe.grid, params.fusion, recipe.depth_range_m, window)
-        keep = cues.keep & jnp.isfinite(cues.values).all(axis=-1)
+            free = carve(
+                params.camera, pose, cloud.depth_m, cloud.valid, recipe.grid, fusion, recipe.depth_range_m, window
+            )
+        keep &= jnp.isfinite(values).all(axis=-1)
         return {
-            "voxel": flat_voxel_index(recipe.grid, points_world, keep, whole_window(recipe.grid)),
+            "voxel": flat_voxel_index(recipe.grid, cloud.points_world, keep, whole_window(recipe.grid)),
             "voxels": jnp.asarray(int(np.prod(recipe.grid.shape))),
-            "depth_m": depth_m.reshape(-1),
-            "values": cues.values,
-            "labels": cues.labels,
-            "shared": cues.shared,
+            "depth_m": cloud.depth_m.reshape(-1),
+            "values": values,
+            "of_frame": of_frame,
             "free": free,
             "start": window.start,
         }
@@ -160,27 +165,22 @@ def _observer(recipe: CacheRecipe) -> Any:
 
 
 def _thinned(seen: dict[str, Any], shape: tuple[int, ...], block_px: int) -> _Kept:
-    """The points of a frame that fell into the grid, those of one voxel, block and label as one."""
+    """The points of a frame that fell into the grid, those of one voxel and block as one."""
     inside = np.flatnonzero(seen["voxel"] < seen["voxels"])
     voxel, depth_m, values = (seen[name][inside] for name in ("voxel", "depth_m", "values"))
-    labels = None if seen["labels"] is None else seen["labels"][inside]
     if block_px == 1:
-        return _Kept(voxel, depth_m, np.ones(len(voxel), np.float32), labels, values)
+        return _Kept(voxel, depth_m, np.ones(len(voxel), np.float32), values)
     row, column = np.divmod(inside, shape[1])
     across = -(-shape[1] // block_px)
     block = (row // block_px).astype(np.int64) * across + column // block_px
     key = voxel.astype(np.int64) * (across * -(-shape[0] // block_px)) + block
-    if labels is not None:
-        key = key * 256 + (labels & 255)
     _, first, group, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
 
     def mean(numbers: np.ndarray) -> np.ndarray:
         return (np.bincount(group, numbers, minlength=len(count)) / count).astype(np.float32)
 
-    values = np.stack([mean(values[:, d]) for d in range(values.shape[1])], -1) if values.shape[1] else values[first]
-    return _Kept(
-        voxel[first], mean(depth_m), count.astype(np.float32), None if labels is None else labels[first], values
-    )
+    means = np.stack([mean(values[:, d]) for d in range(values.shape[1])], -1)
+    return _Kept(voxel[first], mean(depth_m), count.astype(np.float32), means)
 
 
 def _count_freed(
@@ -195,7 +195,7 @@ def _count_freed(
     freed[hit[inside]] -= free[tuple(places[inside].T)]
 
 
-def _joined(kept: list[_Kept], shared: list[PyTree], freed: np.ndarray) -> EvidenceCache:
+def _joined(kept: list[_Kept], of_frames: list[PyTree], freed: np.ndarray) -> EvidenceCache:
     frame = np.repeat(np.arange(len(kept)), [len(one.voxel) for one in kept])
     voxel, of_point = np.unique(np.concatenate([one.voxel for one in kept]), return_inverse=True)
     pairs, pair = np.unique(frame.astype(np.int64) * len(voxel) + of_point, return_inverse=True)
@@ -205,7 +205,6 @@ def _joined(kept: list[_Kept], shared: list[PyTree], freed: np.ndarray) -> Evide
 
     return EvidenceCache(
         values=together("values"),
-        labels=None if kept[0].labels is None else together("labels"),
         depth_m=together("depth_m"),
         points=together("points"),
         frame=jnp.asarray(frame, jnp.int32),
@@ -213,12 +212,12 @@ def _joined(kept: list[_Kept], shared: list[PyTree], freed: np.ndarray) -> Evide
         voxel_of_pair=jnp.asarray(pairs % len(voxel), jnp.int32),
         freed=jnp.asarray(freed[voxel], jnp.float32),
         voxel=jnp.asarray(voxel, jnp.int32),
-        shared=jax.tree.map(lambda *leaves: jnp.stack(leaves), *shared),
+        of_frame=jax.tree.map(lambda *leaves: jnp.stack(leaves), *of_frames),
     )
 
 
 def fused_evidence(
-    recipe: CacheRecipe, cache: EvidenceCache, fusion: FusionParams, numbers: dict[str, Float[Array, ""]]
+    recipe: CacheRecipe, cache: EvidenceCache, fusion: FusionParams, numbers: Numbers
 ) -> Float[Array, "K V"]:
     """The evidence of all frames in the cached voxels: what mapping them gives, differentiable in the parameters.
 
@@ -226,7 +225,7 @@ def fused_evidence(
         recipe: what the cache was made for.
         cache: of the frames.
         fusion: the sensor model.
-        numbers: those of the labeller (`TunableLabels.numbers`).
+        numbers: those of the labeller (`tunable_numbers`).
 
     Returns:
         Occupancy, then one row for each class.
@@ -234,24 +233,30 @@ def fused_evidence(
     classes, pairs, rule = len(recipe.labeller.classes), cache.voxel_of_pair.shape[0], recipe.rule
     weights = cache.points
     if rule.range_weighting:
-        weights = weights * range_weight(recipe.camera, recipe.grid, cache.depth_m, fusion)
+        sigma_m = depth_sigma(recipe.camera, cache.depth_m, fusion.disparity_sigma_px)
+        weights = weights * range_weight(recipe.grid, sigma_m)
     empty = jnp.zeros(pairs, weights.dtype)
-    if cache.labels is not None:
-        known = (cache.labels >= 0) & (cache.labels < classes)
-        row = jnp.where(known, cache.labels, classes)
-        counts = jnp.zeros((classes + 1) * pairs, weights.dtype).at[row * pairs + cache.pair].add(weights)
-    else:
-        soft = tunable_labels(recipe.labeller, recipe.rule).probabilities(
-            cache.values, cache.frame, cache.shared, numbers
-        )
-        shares = [*(soft[:, index] for index in range(classes)), 1.0 - soft.sum(axis=-1)]
-        # One flat scatter for each class is thrice as fast as scattering rows.
-        counts = jnp.stack([empty.at[cache.pair].add(share * weights) for share in shares])
+    soft = _cached_shares(recipe, cache, numbers)
+    shares = [*(soft[:, index] for index in range(classes)), 1.0 - soft.sum(axis=-1)]
+    # One flat scatter for each class is thrice as fast as scattering rows.
+    counts = jnp.stack([empty.at[cache.pair].add(share * weights) for share in shares])
     evidence = frame_evidence(counts.reshape(classes + 1, pairs, 1, 1), None, fusion, rule).reshape(-1, pairs)
     nothing = jnp.zeros(cache.voxel.shape[0], evidence.dtype)
     log_odds = [nothing.at[cache.voxel_of_pair].add(channel) for channel in evidence]
     log_odds[0] = log_odds[0] + cache.freed * (fusion.occupancy_miss - fusion.occupancy_prior)
     return jnp.stack(log_odds)
+
+
+def _cached_shares(recipe: CacheRecipe, cache: EvidenceCache, numbers: Numbers) -> Float[Array, "G C"]:
+    """The probability of each class for each kept point."""
+    labeller = recipe.labeller
+    if not _is_soft(labeller, recipe.rule):
+        return cache.values
+    estimates: PyTree = ()
+    if jax.tree.leaves(cache.of_frame):
+        of_frames = jax.vmap(lambda of_frame: labeller.estimate(of_frame, numbers))(cache.of_frame)
+        estimates = jax.tree.map(lambda leaf: leaf[cache.frame], of_frames)
+    return jnp.stack(labeller.label(cache.values, estimates, numbers), axis=-1)
 
 
 def map_of_cache(recipe: CacheRecipe, cache: EvidenceCache, log_odds: Float[Array, "K V"]) -> VoxelMap:

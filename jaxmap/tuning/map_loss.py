@@ -1,6 +1,6 @@
 """The score of a map as a loss: how far its cells are from the ground truth, differentiable in the evidence.
 
-    loss = nll * NLL + soft_iou * (1 - IoU)
+    loss = nll_weight * NLL + iou_weight * (1 - IoU)
 
 NLL is the mean negative log-likelihood of the labelled cells; the soft IoU counts how surely cells are called by the
 class. Cells, areas and truth are those that `jaxmap evaluate` scores (`evaluation.cells`, `evaluation.truth_cells`).
@@ -19,8 +19,10 @@ from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.cells import CellGrid, ColumnShares, area_in_cells, column_shares, make_cells
 from jaxmap.evaluation.truth_cells import TruthCells, truth_cells
-from jaxmap.fusion.params import FusionParams, FusionRule
-from jaxmap.tuning.soft_view import SoftColumns, Softness, soft_columns_of_map
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
+from jaxmap.tuning.options import MapLossOptions
+from jaxmap.tuning.soft_view import SoftColumns, soft_columns_of_map
 from jaxmap.types import GridSpec, VoxelMap
 
 _LEAST_PROBABILITY = 1e-6
@@ -40,25 +42,6 @@ class MapTruth(NamedTuple):
     shares: ColumnShares
     truly: Float[Array, "I J"]
     counted: Bool[Array, "I J"]
-
-
-class LossOptions(NamedTuple):
-    """What a loss is made of.
-
-    Attributes:
-        nll: weight of the negative log-likelihood.
-        soft_iou: weight of 1 - soft IoU.
-        class_weight: of the cells of the class in the likelihood, beside 1 for the others. Other weights than 1 find
-            more rocks and cost calibration: probabilities then come out as if rocks were that much more frequent.
-        rock_fraction: a cell is called where columns of the class cover this share of its area.
-        softness: widths of the decisions.
-    """
-
-    nll: float = 1.0
-    soft_iou: float = 1.0
-    class_weight: float = 1.0
-    rock_fraction: float = _CALLED_SHARE
-    softness: Softness = Softness()
 
 
 class SoftCells(NamedTuple):
@@ -113,17 +96,17 @@ def make_map_truth(
 
 
 def soft_cells(
-    columns: SoftColumns, shares: ColumnShares, prior: Float[Array, ""], options: LossOptions | None = None
+    columns: SoftColumns, shares: ColumnShares, prior: Float[Array, ""], options: MapLossOptions | None = None
 ) -> SoftCells:
     """Brings soft columns to cells by area, as `evaluation.cells.map_cells` does.
 
     Args:
-        columns: one class, from above.
+        columns: one class of the top-down map.
         shares: how the columns fall into cells.
         prior: probability of the class where nothing was observed.
         options: `rock_fraction` and the softness of a cell's decision.
     """
-    options = options or LossOptions()
+    options = options or MapLossOptions()
     area, known, share = (
         area_in_cells(shares, values) / shares.columns_per_cell
         for values in (columns.seen, columns.seen * columns.probability, columns.seen * columns.called)
@@ -132,7 +115,7 @@ def soft_cells(
     return SoftCells(area, known + (1.0 - area) * prior, called)
 
 
-def cells_loss(said: SoftCells, truth: MapTruth, options: LossOptions) -> tuple[Float[Array, ""], LossParts]:
+def cells_loss(said: SoftCells, truth: MapTruth, options: MapLossOptions) -> tuple[Float[Array, ""], LossParts]:
     """The loss of cells; 0 where none counts.
 
     Probabilities are drawn in by 1e-6 from 0 and 1: one certain mistake has a finite price, and a gradient.
@@ -147,7 +130,7 @@ def cells_loss(said: SoftCells, truth: MapTruth, options: LossOptions) -> tuple[
     either = (counted * (said.called + truth.truly - said.called * truth.truly)).sum()
     # Where nothing is of the class and nothing is called so, the two agree.
     soft_iou = (both + _LEAST_PROBABILITY) / (either + _LEAST_PROBABILITY)
-    loss = options.nll * nll + options.soft_iou * (1.0 - soft_iou)
+    loss = options.nll_weight * nll + options.iou_weight * (1.0 - soft_iou)
     return loss, LossParts(nll, soft_iou, counted.sum())
 
 
@@ -157,7 +140,7 @@ def map_loss(
     rule: FusionRule,
     truth: MapTruth,
     target: int,
-    options: LossOptions | None = None,
+    options: MapLossOptions | None = None,
 ) -> tuple[Float[Array, ""], LossParts]:
     """The loss of a dense map against the truth; finite, and so are its gradients, whatever the map holds.
 
@@ -169,9 +152,9 @@ def map_loss(
         rule: see `params`.
         truth: ground truth in the cells of the map's grid.
         target: index of the class that is scored among the map's classes.
-        options: what the loss is made of.
+        options: the terms of the loss.
     """
-    options = options or LossOptions()
+    options = options or MapLossOptions()
     columns = soft_columns_of_map(voxel_map, params, rule, target, options.softness)
     said = soft_cells(columns, truth.shares, jax.nn.sigmoid(params.class_prior[target]), options)
     seen = jax.lax.stop_gradient(said.area) > _LEAST_AREA

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import MapperParams, make_mapper
@@ -29,7 +30,8 @@ from jaxmap.models.deeplab import Weights, training_form
 from jaxmap.training.options import TrainingOptions
 from jaxmap.training.step import StepInfo, TrainState, make_updater, parted
 from jaxmap.tuning.frame_crops import FrameBatch, crop_frame, points_per_pixel, widest_camera
-from jaxmap.tuning.map_loss import LossOptions, MapTruth, cells_loss, soft_cells
+from jaxmap.tuning.map_loss import MapTruth, cells_loss, soft_cells
+from jaxmap.tuning.options import MapLossOptions
 from jaxmap.tuning.pull_back import frame_evidence
 from jaxmap.tuning.soft_view import soft_columns_of_map
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap
@@ -63,7 +65,7 @@ class Site(NamedTuple):
     params: FusionParams
     rule: FusionRule
     truths: Mapping[int, MapTruth]
-    losses: Mapping[int, LossOptions]
+    losses: Mapping[int, MapLossOptions]
     anchor: float = 1.0
     temperature: float = 3.0
 

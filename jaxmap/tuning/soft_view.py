@@ -1,7 +1,7 @@
-"""The view from above as a smooth function of the evidence: the twin of `fusion.query.top_down` for gradients.
+"""The top-down map as a smooth function of the evidence: the twin of `fusion.query.top_down` for gradients.
 
-Decisions become logistic functions, so that the score of a map has a slope everywhere; as the widths of `Softness` go
-to zero, the soft view goes to the view that is scored.
+Decisions become logistic functions, so that the score of a map has a gradient everywhere; as the widths of `Softness`
+go to zero, the soft map approaches the one that is scored.
 """
 
 from __future__ import annotations
@@ -15,19 +15,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmap.fusion.neighbours import spread_evidence
-from jaxmap.fusion.params import FusionParams, FusionRule
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams
+from jaxmap.tuning.options import Softness
 from jaxmap.types import VoxelMap
 
 _FAR_BELOW = -1e4
 """Log-odds that lose every comparison, and are finite all the same: gradients of infinities are not."""
-
-
-class Softness(NamedTuple):
-    """Widths of the decisions: those of voxels and columns in log-odds, that of cells as a share of their area."""
-
-    occupied: float = 0.1
-    called: float = 0.5
-    cell: float = 0.1
 
 
 class Columns(NamedTuple):
@@ -38,7 +32,7 @@ class Columns(NamedTuple):
 
 
 class SoftColumns(NamedTuple):
-    """One class, seen from above.
+    """One class in the top-down map.
 
     `seen` is how surely a surface was observed in the column, `probability` that of the class given this, `called` how
     surely the column is labelled with the class.
@@ -79,7 +73,7 @@ def soft_columns(
     target: int,
     softness: Softness,
 ) -> SoftColumns:
-    """One class as the voxels show it from above.
+    """One class of the top-down map that voxels make.
 
     Args:
         log_odds: evidence of voxels, occupancy first; of a grid, or of a list.
@@ -110,7 +104,7 @@ def soft_columns(
         return column + params.class_prior[index]
 
     own = read(target)
-    priority = [classes.index(name) for name in rule.priority_classes if name in classes]
+    priority = rule.priority(classes)
     if target in priority:
         lead = own - _logit(params.class_threshold)
     else:

@@ -16,7 +16,8 @@ from jaxmap.evaluation.cells import MapCells, column_shares, map_cells
 from jaxmap.fusion.query import top_down
 from jaxmap.tuning.cell_scores import ScoredCells
 from jaxmap.tuning.evidence_cache import CacheRecipe, EvidenceCache, fused_evidence, map_of_cache
-from jaxmap.tuning.map_loss import LossOptions, LossParts, MapTruth, SoftCells, cells_loss, make_map_truth, soft_cells
+from jaxmap.tuning.map_loss import LossParts, MapTruth, SoftCells, cells_loss, make_map_truth, soft_cells
+from jaxmap.tuning.options import MapLossOptions
 from jaxmap.tuning.parametrisation import TunedParams
 from jaxmap.tuning.soft_view import columns_of_list, soft_columns
 from jaxmap.tuning.split import ground_groups, hold_out
@@ -111,7 +112,7 @@ def check_classes(traverses: list[Traverse], target: str) -> None:
 
 
 def traverse_losses(
-    traverse: Traverse, params: TunedParams, target: int, options: LossOptions
+    traverse: Traverse, params: TunedParams, target: int, options: MapLossOptions
 ) -> tuple[tuple[Array, LossParts], tuple[Array, LossParts]]:
     """The loss of the ground to tune on, and of the ground held out; each with its parts."""
     said = _said(traverse, params, target, options)
@@ -120,7 +121,7 @@ def traverse_losses(
     return tuned, kept
 
 
-def _said(traverse: Traverse, params: TunedParams, target: int, options: LossOptions) -> SoftCells:
+def _said(traverse: Traverse, params: TunedParams, target: int, options: MapLossOptions) -> SoftCells:
     recipe, cache = traverse.recipe, traverse.arrays.cache
     evidence = fused_evidence(recipe, cache, params.fusion, params.labeller)
     columns = soft_columns(

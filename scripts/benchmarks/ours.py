@@ -26,7 +26,8 @@ from benchmarks.scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_p
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.view import Reach, view_of
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import view_window, window_shape

@@ -14,7 +14,8 @@ from strategies import CLASSES, rngs
 
 from jaxmap.ensemble.layer import ensemble_layers, layer_names, named_layers, stored_layers
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import top_down
 from jaxmap.mapping.store import MEMBERS, MapAttributes, load_map, save_map
 from jaxmap.types import GridSpec, VoxelMap

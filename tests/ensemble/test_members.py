@@ -19,7 +19,8 @@ from jaxmap.ensemble.layer import ensemble_layers
 from jaxmap.ensemble.members import doubted
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labellers.base import make_no_labeller
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper

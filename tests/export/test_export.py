@@ -15,7 +15,8 @@ from jaxmap.errors import JaxmapError
 from jaxmap.export.geotiff import write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import TopDown, class_probabilities, occupancy_probability, occupied, top_down, voxel_labels
 from jaxmap.geometry.grid import voxel_centres, world_to_voxel
 from jaxmap.labels import IGNORE, ROVER_CLASSES, class_colours

@@ -20,7 +20,8 @@ from strategies import HEIGHT_PX, WIDTH_PX, cameras, rngs
 from test_carve import SHARP, see_through, views
 from truth_files import CRS, SITE, write_raster
 
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labellers.base import make_no_labeller
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.types import Frame, GridSpec, make_grid, make_stereo_camera

@@ -25,7 +25,8 @@ from strategies import (
 )
 
 from jaxmap.fusion import integrate as kernels
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.geometry.grid import Window, view_window, window_shape
 from jaxmap.types import PointLabels, make_grid, make_stereo_camera, make_voxel_map
 

@@ -12,7 +12,8 @@ from strategies import CLASSES, rngs
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.neighbours import spread_evidence
-from jaxmap.fusion.params import FusionRule, make_fusion_params, stored_fusion
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params, stored_fusion
 from jaxmap.fusion.query import top_down, voxel_labels
 from jaxmap.types import make_grid, make_voxel_map
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from strategies import CLASSES, GRID_SHAPE, grids, random_map, rngs
 
 from jaxmap.fusion import query
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labels import IGNORE
 from jaxmap.types import make_grid, make_voxel_map
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from strategies import CLASSES, GRID_SHAPE, cameras, grids, rngs
 
 from jaxmap.fusion import sensor_model
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.geometry.camera import depth_at_sigma
 
 weight_of = jax.jit(sensor_model.range_weight)

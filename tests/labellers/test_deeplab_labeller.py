@@ -18,7 +18,8 @@ from reference_pixelwise import merged_probabilities
 from strategies import HEIGHT_PX, WIDTH_PX, disparities, rngs
 
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labellers.base import Labeller, harden
 from jaxmap.labellers.deeplab import make_class_map, make_deeplab_labeller
 from jaxmap.labels import IGNORE

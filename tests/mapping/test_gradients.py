@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, disparities
 
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import class_probabilities, top_down
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller

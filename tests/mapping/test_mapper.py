@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, disparities, poses, rngs
 
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import top_down
 from jaxmap.labellers.base import make_no_labeller
 from jaxmap.labellers.files import make_files_labeller

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import UsageError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.host.files import config_folder
 from jaxmap.labellers.deeplab import make_deeplab_labeller

@@ -18,7 +18,8 @@ from tiny_training import ARCHITECTURE as TINY
 from tiny_training import network_is_tiny  # noqa: F401
 
 from jaxmap.evaluation.cells import column_shares, make_cells
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.models.deeplab import initial_weights
 from jaxmap.training.options import AugmentationOptions, OptimiserOptions, TrainingOptions

@@ -15,7 +15,8 @@ from networks import small_model
 from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, disparities
 
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.cells import map_cells
-from jaxmap.fusion.params import FusionParams, FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams, make_fusion_params
 from jaxmap.fusion.query import top_down
 from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth, map_loss, soft_cells
 from jaxmap.tuning.soft_view import Softness, columns_of_list, soft_columns, soft_columns_of_map

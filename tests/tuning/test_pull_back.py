@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from small_scenes import small_camera
 
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import class_probabilities, top_down
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller

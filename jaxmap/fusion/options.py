@@ -1,0 +1,94 @@
+"""The options of fusion: its discrete choices, and the numbers of sensor model, filter and decision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Annotated, Any, Literal
+
+from annotated_types import Le
+
+from jaxmap.errors import UsageError
+from jaxmap.host.settings import NotNegative, Positive, Probability, options
+
+DEFAULT_PRIORITY = ("rock",)
+
+
+@options("fusion")
+class FusionRule:
+    """The discrete choices of fusion, fixed when the step is compiled."""
+
+    per_frame: Literal["sum", "once", "mean"] = "mean"
+    """How the points of a frame in a voxel count. sum: each adds its increment; once: each label that is present adds
+    its increment once; mean: the frame adds one increment, shared by the fractions of the labels, in full from
+    full_evidence_points on."""
+    carve: bool = True
+    """Mark voxels that were seen through as free."""
+    range_weighting: bool = True
+    """Let points count less as depth noise outgrows the voxel."""
+    column: Literal["max", "sum"] = "sum"
+    """Top-down map: the greatest evidence in a column, or the sum of it."""
+    priority_classes: tuple[str, ...] | None = None
+    """Classes that win a cell as soon as they pass class_threshold, in this order; the others compete by probability.
+    By default rock, if it is a class."""
+
+    def priority(self, classes: Sequence[str]) -> list[int]:
+        """Indices of the priority classes among `classes`, in their order."""
+        names = DEFAULT_PRIORITY if self.priority_classes is None else self.priority_classes
+        return [classes.index(name) for name in names if name in classes]
+
+    def target(self, classes: Sequence[str]) -> str | None:
+        """The class that cells are asked about first: the first priority class that is there."""
+        return next((classes[index] for index in self.priority(classes)), None)
+
+
+@options("fusion")
+class FusionOptions(FusionRule):
+    """The sensor model, the filter and the decision."""
+
+    occupancy_hit: Annotated[float, NotNegative] = 0.85
+    """Log-odds that a frame with points in a voxel adds to its occupancy."""
+    occupancy_miss: Annotated[float, Le(0)] = -0.4
+    """Log-odds added to the occupancy of a voxel that was seen through."""
+    occupancy_prior: Annotated[float, Probability] = 0.5
+    """Probability that a voxel is occupied before anything was seen."""
+    class_hit: float = 0.9
+    """Log-odds that an observed label adds to its class."""
+    class_miss: float = -0.9
+    """Log-odds that an observed label adds to every other class."""
+    class_increments: tuple[tuple[float, ...], ...] | None = None
+    """The whole matrix, row: observed label, column: class; overrides class_hit and class_miss."""
+    class_prior: Annotated[float, Probability] | tuple[Annotated[float, Probability], ...] = 0.5
+    """Probability of a class before anything was seen; one number, or one per class."""
+    disparity_sigma_px: Annotated[float, Positive] = 0.5
+    """Standard deviation of disparity."""
+    full_evidence_points: Annotated[float, Positive] = 8.0
+    """Points from which on a frame counts in full (per_frame mean)."""
+    occupancy_threshold: Annotated[float, Probability] = 0.5
+    """A voxel is occupied above this probability."""
+    class_threshold: Annotated[float, Probability] = 0.5
+    """A priority class wins above this probability."""
+    class_kernel: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    """One odd square a class: how much of the evidence of neighbouring columns counts when the map is read; tune
+    --kernel learns it."""
+
+    def rule(self, classes: Sequence[str]) -> FusionRule:
+        """The discrete choices, for a map of these classes.
+
+        Raises:
+            UsageError: a priority class is none of them.
+        """
+        if unknown := [name for name in self.priority_classes or () if classes and name not in classes]:
+            raise UsageError(
+                f"{', '.join(unknown)} is not one of the classes {' '.join(classes)}",
+                where="fusion.priority_classes",
+                fix="name classes of the map, or none",
+            )
+        choices: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(FusionRule)}
+        choices["priority_classes"] = tuple(classes[index] for index in self.priority(classes))
+        return FusionRule(**choices)
+
+    def numbers(self) -> dict[str, Any]:
+        """All but the discrete choices, by name."""
+        discrete = {field.name for field in fields(FusionRule)}
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in discrete}

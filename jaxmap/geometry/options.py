@@ -1,0 +1,63 @@
+"""The options of geometry: the bounds of a map, the depths that are mapped, and the fit of a plane."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Interval
+
+from jaxmap.host.settings import NotNegative, Positive, options
+
+Edge = Annotated[float, Positive]
+Triple = tuple[float, float, float]
+
+
+@options("grid")
+class GridOptions:
+    """Bounds and resolution of the map."""
+
+    voxel_size_m: Edge | tuple[Edge, Edge, Edge] | None = None
+    """Edge of a voxel, or three edges (x, y, z). By default 0.05 0.05 0.2: columns finer than the cells that maps are
+    scored in, so that rocks are measured by area; or the next of 0.1 0.1 0.2 and 0.2 whose map fits the memory."""
+    lower_m: Triple | None = None
+    """Lower corner of the map, relative to the site origin; by default the poses and the range decide."""
+    upper_m: Triple | None = None
+    """Upper corner, with the lower one."""
+    below_camera_m: Annotated[float, Positive] = 3.0
+    """How far automatic bounds reach below the lowest camera."""
+    above_camera_m: Annotated[float, Positive] = 2.0
+    """How far automatic bounds reach above the highest camera."""
+    max_memory_gib: Annotated[float, Positive] = 2.0
+    """Larger maps are refused."""
+
+
+@options("depth")
+class DepthOptions:
+    """Which depths are mapped."""
+
+    min_m: Annotated[float, NotNegative] = 0.3
+    """Nearer points are left out."""
+    max_m: Annotated[float, Positive] | None = None
+    """Farther points are left out; by default where depth noise reaches max_sigma_m."""
+    max_sigma_m: Annotated[float, Positive] = 0.5
+    """Depth noise that sets the automatic range."""
+
+
+@options("plane")
+class PlaneFitOptions:
+    """The fit of a plane by MLESAC (`geometry.plane`)."""
+
+    sigma_m: Annotated[float, Positive] = 0.05
+    """Standard deviation of points on the plane."""
+    outlier_range_m: Annotated[float, Positive] = 4.0
+    """Range over which points off the plane spread."""
+    max_tilt_rad: Annotated[float, Interval(gt=0, le=1.5708)] = 0.6
+    """Planes that lean further are walls."""
+    hypotheses: Annotated[int, Positive] = 256
+    """Planes tried, each through three points."""
+    sample_points: Annotated[int, Interval(ge=3)] = 8192
+    """Points drawn to judge them."""
+    em_rounds: Annotated[int, Positive] = 3
+    """Rounds of expectation maximisation."""
+    cost: Literal["mlesac", "msac"] = "mlesac"
+    """The score of a plane."""
