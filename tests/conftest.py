@@ -21,7 +21,7 @@ CHECKED_MODULES = (
     "evaluation.pose_scores",
     "evaluation.segmentation_scores",
     "geometry",
-    "labellers",
+    "labellers.deeplab", "labellers.files", "labellers.plane",
     "labels",
     "localisation",
     "mapping.step",

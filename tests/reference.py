@@ -178,10 +178,11 @@ def occupied(voxel_map, params) -> np.ndarray:
 def decide(evidence: Sequence[float], params, rule, classes) -> int:
     """The label of one cell that is known to be occupied, from its evidence (priors left out)."""
     posterior = f64(evidence) + f64(params.class_prior)
-    for name in rule.priority_classes:
+    priority = ("rock",) if rule.priority_classes is None else rule.priority_classes
+    for name in priority:
         if name in classes and sigmoid(posterior[classes.index(name)]) > float(params.class_threshold):
             return classes.index(name)
-    rivals = [c for c in range(len(classes)) if classes[c] not in rule.priority_classes and evidence[c] > 0]
+    rivals = [c for c in range(len(classes)) if classes[c] not in priority and evidence[c] > 0]
     return max(rivals, key=lambda c: posterior[c], default=IGNORE)
 
 

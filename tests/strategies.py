@@ -11,6 +11,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from jaxmap.ensemble.options import EnsembleOptions
+from jaxmap.geometry.camera import PointCloud
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.types import GridSpec, PointLabels, StereoCamera, VoxelMap, make_stereo_camera, make_voxel_map
 
@@ -113,3 +114,10 @@ def disparities(rng: np.random.Generator, low_px: float = 1.0, high_px: float = 
     for limit, value in ((0.1, np.nan), (0.04, 0.0), (0.03, -3.0), (0.02, np.inf), (0.01, -np.inf)):
         disparity[hole < limit] = value
     return disparity
+
+
+def cloud_of(points, valid) -> PointCloud:
+    """A point cloud of points that are given, one for each pixel, all at a depth of 1 m."""
+    flat = jnp.asarray(valid).reshape(HEIGHT_PX, WIDTH_PX)
+    ones = jnp.ones((HEIGHT_PX, WIDTH_PX))
+    return PointCloud(jnp.asarray(points), ones, ones, flat, flat)

@@ -11,8 +11,10 @@ PACKAGE = Path(__file__).resolve().parent.parent / "jaxmap"
 FLOORS = (
     # values
     "errors types labels",
-    # pure geometry, and the host's files, threads and memory
-    "host geometry localisation",
+    # the host's files, threads, memory and settings
+    "host",
+    # pure geometry
+    "geometry localisation",
     "models stereo fusion profiling",
     # what labels points, what doubts a map, what reads logs
     "labellers ensemble datasets",

@@ -54,6 +54,9 @@ def make_fusion_params(classes: Sequence[str], options: FusionOptions | None = N
     Raises:
         JaxmapError: a number out of bounds, or a matrix, prior or kernel of another size than the classes ask for.
     """
+    changes = {
+        name: np.asarray(value).tolist() if hasattr(value, "shape") else value for name, value in changes.items()
+    }
     numbers = replace(options or FusionOptions(), **changes)
     count = len(classes)
     priors = np.asarray(numbers.class_prior, np.float64)
@@ -63,7 +66,7 @@ def make_fusion_params(classes: Sequence[str], options: FusionOptions | None = N
         )
     increments = np.full((count, count), numbers.class_miss) + np.eye(count) * (numbers.class_hit - numbers.class_miss)
     if numbers.class_increments is not None:
-        increments = _array(numbers.class_increments)
+        increments = _array(numbers.class_increments) if count else increments
         if increments.shape != (count, count):
             raise JaxmapError(
                 f"class_increments is not a finite {count}x{count} matrix",

@@ -12,7 +12,7 @@ from strategies import CLASSES, GRID_SHAPE, cameras, grids, rngs
 from jaxmap.fusion import sensor_model
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
-from jaxmap.geometry.camera import depth_at_sigma
+from jaxmap.geometry.camera import depth_at_sigma, depth_sigma
 
 weight_of = jax.jit(sensor_model.range_weight)
 evidence_of = jax.jit(sensor_model.frame_evidence, static_argnames="rule")
@@ -95,7 +95,7 @@ def test_prior_is_taken_off_each_observation_as_the_standard_filter_does():
 def test_range_weight_equals_the_twin_and_falls_with_depth(camera, grid, rng):
     depth_m = np.sort(rng.uniform(0.2, 60, 64)).astype(np.float32)
     params = make_fusion_params(CLASSES, disparity_sigma_px=float(rng.uniform(0.1, 2)))
-    weight = np.asarray(weight_of(camera, grid, depth_m, params))
+    weight = np.asarray(weight_of(grid, depth_sigma(camera, depth_m, params.disparity_sigma_px)))
     np.testing.assert_allclose(weight, reference.range_weight(camera, grid, depth_m, params), rtol=1e-5)
     assert np.all(np.diff(weight) <= 0)
     assert np.all((weight > 0) & (weight <= 1))
@@ -103,9 +103,8 @@ def test_range_weight_equals_the_twin_and_falls_with_depth(camera, grid, rng):
 
 @given(cameras(), grids())
 def test_range_weight_is_one_half_where_noise_equals_the_voxel(camera, grid):
-    params = make_fusion_params(CLASSES, disparity_sigma_px=0.5)
     depth_m = depth_at_sigma(camera, float(grid.voxel_size_m.mean()), 0.5)
-    np.testing.assert_allclose(weight_of(camera, grid, depth_m, params), 0.5, rtol=1e-5)
+    np.testing.assert_allclose(weight_of(grid, depth_sigma(camera, depth_m, 0.5)), 0.5, rtol=1e-5)
 
 
 @given(rngs())

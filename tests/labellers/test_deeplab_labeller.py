@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from networks import NETWORK_CLASSES, small_model
 from reference_pixelwise import merged_probabilities
-from strategies import HEIGHT_PX, WIDTH_PX, disparities, rngs
+from strategies import HEIGHT_PX, WIDTH_PX, cloud_of, disparities, rngs
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
-from jaxmap.labellers.base import Labeller, harden
-from jaxmap.labellers.deeplab import make_class_map, make_deeplab_labeller
+from jaxmap.labellers.base import Labeller, LabellerParams, harden, label_points
+from jaxmap.labellers.deeplab import make_deeplab_labeller, map_classes
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.runs.segmentation import Segmenter
@@ -51,13 +51,13 @@ def image_of(seed: int) -> np.ndarray:
 @cache
 def labeller_of(*, renamed: bool = False, **options) -> Labeller:
     """A labeller whose function is compiled once for all tests."""
-    labeller = make_deeplab_labeller(small_model(), class_map=RENAMED if renamed else None, **options)
+    labeller = make_deeplab_labeller(small_model(), class_map=RENAMED if renamed else {}, **options)
     return labeller._replace(label=jax.jit(labeller.label))
 
 
 def labelled(labeller: Labeller, frame: Frame, params=None) -> PointLabels:
     points, valid = jnp.zeros((PIXELS, 3)), jnp.ones(PIXELS, bool)
-    return labeller.label(frame, points, valid, labeller.params if params is None else params, KEY)[0]
+    return label_points(labeller, frame, cloud_of(points, valid), labeller.params if params is None else params, KEY)[0]
 
 
 @cache
@@ -112,7 +112,7 @@ def test_a_grey_image_is_taken_as_one_of_three_equal_channels():
 
 def test_a_high_temperature_makes_all_classes_alike():
     labeller = labeller_of()
-    hot = labeller.params._replace(log_temperature=jnp.float32(12.0))
+    hot = labeller.params._replace(numbers={"temperature": jnp.float32(np.exp(12.0))})
     shares = labelled(labeller, frame_of(image_of(0)), hot).probabilities
     np.testing.assert_allclose(shares, 1 / len(NETWORK_CLASSES), atol=1e-3)
 
@@ -136,7 +136,7 @@ NAMES = st.sampled_from(["a", "b", "c", "d", "e"])
 )
 def test_a_class_map_sends_every_class_to_its_name_or_is_refused(network, classes, renamed):
     try:
-        mapped = make_class_map(network, classes, renamed)
+        mapped = map_classes(network, classes, renamed)
     except JaxmapError:
         names = set(renamed.values()) or set(network) if classes is None else set(classes)
         reached = {renamed.get(name, name) for name in network}
@@ -151,19 +151,19 @@ def test_a_class_map_sends_every_class_to_its_name_or_is_refused(network, classe
     assert mapped.classes == tuple(classes or dict.fromkeys(renamed.values()) or network)
 
 
-def test_all_faults_of_a_class_map_are_told_together():
+def test_all_faults_of_a_class_map_are_named_together():
     says = "the network has no class bus, tram; the map has no class car; no class of the network becomes mud"
     with pytest.raises(JaxmapError, match=says) as caught:
-        make_class_map(NETWORK_CLASSES, ("sand", "mud"), {"bus": "car", "tram": "car"})
+        map_classes(NETWORK_CLASSES, ("sand", "mud"), {"bus": "car", "tram": "car"})
     assert "sky, sand, gravel, boulder, rover" in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (dict(size_px=(0, 32)), "size 0 32 in deeplab labeller; give a height and a width above 0"),
-        (dict(temperature=0.0), "temperature 0.0 in deeplab labeller; give a number above 0"),
-        (dict(temperature=float("nan")), "give a number above 0"),
+        (dict(size_px=(0, 32)), "deeplab.size_px.0 is 0: input should be greater than 0"),
+        (dict(temperature=0.0), "deeplab.temperature is 0.0: input should be greater than 0"),
+        (dict(temperature=float("nan")), "deeplab.temperature is nan"),
         (dict(classes=()), "the map has no class at all"),
     ],
 )
@@ -196,7 +196,7 @@ def test_the_step_compiles_once_for_a_sequence_and_scan_equals_loop(soft):
         looped, info = mapper.step(looped, frame, params, KEY)
         infos.append(info)
     # Other weights are no other program: they are not compiled into it.
-    warmer = replace(params, labeller=params.labeller._replace(log_temperature=jnp.float32(0.5)))
+    warmer = replace(params, labeller=params.labeller._replace(numbers={"temperature": jnp.float32(1.6)}))
     mapper.step(mapper.init(), sequence[0], warmer, KEY)
     assert mapper.compilations() == 1
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sequence)
@@ -222,7 +222,7 @@ def test_the_map_is_updated_in_place_and_no_weight_is_donated_or_built_in(soft):
 def test_label_image_shows_what_the_step_gives_the_pixels(soft):
     mapper, params = soft
     shown = np.asarray(mapper.label_image(frame_of(image_of(0)), params, KEY, 0))
-    labels = make_class_map(NETWORK_CLASSES, ("rock", "sand"), RENAMED)
+    labels = map_classes(NETWORK_CLASSES, ("rock", "sand"), RENAMED)
     shares = merged_probabilities(segmented(None).astype(np.float64), labels.targets, 2)
     shares = np.concatenate([shares, 1 - shares.sum(axis=-1, keepdims=True)], axis=-1)
     expected = np.where(shares.argmax(axis=-1) == 2, IGNORE, shares.argmax(axis=-1))
@@ -234,7 +234,7 @@ def test_label_image_shows_what_the_step_gives_the_pixels(soft):
 def test_params_of_another_labeller_are_refused(soft):
     mapper, params = soft
     with pytest.raises(JaxmapError, match="build MapperParams with labeller=labeller.params"):
-        mapper.fuse(mapper.init(), frame_of(image_of(0)), replace(params, labeller=()), KEY)
+        mapper.fuse(mapper.init(), frame_of(image_of(0)), replace(params, labeller=LabellerParams()), KEY)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +249,7 @@ def test_a_frame_without_its_image_is_refused(soft, image, says):
         mapper.fuse(mapper.init(), frame, params, KEY)
 
 
-LEAVES = ("log_temperature", "classifier.kernel", "backbone.stages.1.0.convs.1.bias", "aspp.project.kernel")
+LEAVES = ("temperature", "classifier.kernel", "backbone.stages.1.0.convs.1.bias", "aspp.project.kernel")
 
 
 def test_gradients_of_the_map_with_respect_to_the_network_equal_finite_differences(soft):
@@ -260,8 +260,8 @@ def test_gradients_of_the_map_with_respect_to_the_network_equal_finite_differenc
         weight = np.random.default_rng(9).normal(size=empty.log_odds.shape)
 
         def with_leaf(name: str, value: jax.Array) -> MapperParams:
-            if name == "log_temperature":
-                return replace(params, labeller=params.labeller._replace(log_temperature=value))
+            if name == "temperature":
+                return replace(params, labeller=params.labeller._replace(numbers={name: value}))
             weights = params.labeller.weights | {name: value}
             return replace(params, labeller=params.labeller._replace(weights=weights))
 
@@ -275,8 +275,8 @@ def test_gradients_of_the_map_with_respect_to_the_network_equal_finite_differenc
         gradient = score(params)[1].labeller
         step = 1e-6
         for name in LEAVES:
-            leaf = params.labeller.log_temperature if name == "log_temperature" else params.labeller.weights[name]
-            ours = gradient.log_temperature if name == "log_temperature" else gradient.weights[name]
+            leaf = (params.labeller.numbers | params.labeller.weights)[name]
+            ours = (gradient.numbers | gradient.weights)[name]
             direction = np.random.default_rng(3).normal(size=leaf.shape)
             slope = (
                 float(score(with_leaf(name, leaf + step * direction))[0])

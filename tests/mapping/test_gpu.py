@@ -11,8 +11,9 @@ from fixtures import scene_folder, shared_cache  # noqa: F401
 from planned_runs import planned
 
 from jaxmap.mapping.sequence import prepare_frames
-from jaxmap.mapping.step import StepInfo
+from jaxmap.mapping.step import StepReport
 from jaxmap.runs.mapping_plan import Plan
+from jaxmap.types import Plane
 
 SETTINGS: list[dict[str, Any]] = [
     {"labeller": "none"},
@@ -31,7 +32,7 @@ def gpu() -> jax.Device:
         pytest.skip(f"JAX sees no GPU here ({error})")
 
 
-def mapped(plan: Plan, device: jax.Device) -> tuple[np.ndarray, StepInfo]:
+def mapped(plan: Plan, device: jax.Device) -> tuple[np.ndarray, StepReport]:
     """The map of the whole sequence, made on a device, and what its last step did."""
     frames = prepare_frames(
         plan.sequence, plan.front_end, needs=plan.labeller.needs, pose_errors=plan.pose_errors, workers=1
@@ -45,16 +46,16 @@ def mapped(plan: Plan, device: jax.Device) -> tuple[np.ndarray, StepInfo]:
     return np.asarray(voxel_map.log_odds), info
 
 
-def assert_same_map(one: tuple[np.ndarray, StepInfo], other: tuple[np.ndarray, StepInfo]) -> None:
+def assert_same_map(one: tuple[np.ndarray, StepReport], other: tuple[np.ndarray, StepReport]) -> None:
     """Equal but for points so near to the face of a voxel that rounding decides."""
     apart = np.abs(one[0] - other[0]).max(axis=0) > 0.02
     assert (one[0] != 0).any()
     assert apart.mean() < 2e-3
     for name in ("points_valid", "points_in_range", "points_kept", "voxels_hit", "voxels_freed"):
         np.testing.assert_allclose(getattr(one[1], name), getattr(other[1], name), rtol=5e-3, err_msg=name)
-    if one[1].plane is not None and other[1].plane is not None:
-        np.testing.assert_allclose(one[1].plane.normal, other[1].plane.normal, atol=5e-3)
-        np.testing.assert_allclose(one[1].plane.offset_m, other[1].plane.offset_m, atol=5e-3)
+    if isinstance(one[1].estimate, Plane):
+        np.testing.assert_allclose(one[1].estimate.normal, other[1].estimate.normal, atol=5e-3)
+        np.testing.assert_allclose(one[1].estimate.offset_m, other[1].estimate.offset_m, atol=5e-3)
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda one: "-".join(map(str, one)) + "-" + one["labeller"])

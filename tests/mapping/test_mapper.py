@@ -192,7 +192,7 @@ def test_each_frame_of_a_run_draws_its_own_hypotheses(plane_mapper):
     voxel_map = plane_mapper.init()
     for _ in range(2):
         voxel_map, info = plane_mapper.step(voxel_map, frame, PLANE_PARAMS, KEY)
-        planes.append(np.asarray(info.plane.normal))
+        planes.append(np.asarray(info.estimate.normal))
     assert not np.array_equal(*planes)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from dataclasses import MISSING, asdict, fields
+from dataclasses import MISSING, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,25 +14,13 @@ from hypothesis import strategies as st
 
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import UsageError
-from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.options import FusionOptions, FusionRule
 from jaxmap.fusion.params import make_fusion_params
-from jaxmap.geometry.plane import fit_plane_mlesac
+from jaxmap.geometry.options import DepthOptions, GridOptions
 from jaxmap.host.files import config_folder
-from jaxmap.labellers.deeplab import make_deeplab_labeller
-from jaxmap.labellers.plane import make_plane_labeller
+from jaxmap.labellers.options import DeeplabOptions, PlaneOptions
 from jaxmap.labels import ROVER_CLASSES
-from jaxmap.runs.config import (
-    RULE_FIELDS,
-    DeeplabConfig,
-    FusionConfig,
-    GridConfig,
-    MapConfig,
-    PlaneConfig,
-    check_config,
-    config_tree,
-    load_config,
-    split_fusion,
-)
+from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.stereo.options import StereoOptions
 
 CONFIGS = sorted(config_folder().glob("*.yaml"))
@@ -55,12 +43,6 @@ def test_every_config_loads_and_is_read_to_the_last_key(path):
     assert path.read_text().startswith("#"), "says what it is"
 
 
-def test_defaults_of_the_deeplab_section_are_those_of_the_labeller():
-    labeller = inspect.signature(make_deeplab_labeller).parameters
-    for name, value in asdict(DeeplabConfig()).items():
-        assert (labeller[name].default or {}) == (value or {}), name
-
-
 def test_there_is_a_config_for_the_paper():
     fusion = load_config("chiodini2020").fusion
     assert load_config("chiodini2020").grid.voxel_size_m == 0.2
@@ -79,14 +61,14 @@ configs = st.builds(
     strict=st.booleans(),
     seed=st.integers(0, 2**31 - 1),
     grid=st.builds(
-        GridConfig,
+        GridOptions,
         voxel_size_m=st.floats(0.01, 2) | st.tuples(*[st.floats(0.01, 2)] * 3),
         lower_m=st.none() | st.tuples(*[st.floats(-1e6, 1e6)] * 3),
         max_memory_gib=st.floats(0.1, 64),
     ),
     stereo=st.builds(StereoOptions, alpha=st.floats(-1, 1), num_disparities=st.none() | st.integers(1, 512)),
     fusion=st.builds(
-        FusionConfig,
+        FusionOptions,
         per_frame=st.sampled_from(["sum", "once", "mean"]),
         class_increments=st.none() | st.just(((1.0, -0.5), (-0.25, 0.5))),
         class_prior=st.floats(0.01, 0.99) | st.tuples(st.floats(0.01, 0.99), st.floats(0.01, 0.99)),
@@ -102,35 +84,15 @@ def test_a_config_comes_back_from_its_tree_and_from_yaml(config):
     assert config_tree(check_config(tree)) == tree
 
 
-def test_the_defaults_of_fusion_are_those_of_the_functions():
-    params, rule = split_fusion(FusionConfig(), ROVER_CLASSES)
-    assert FusionRule(**rule) == FusionRule()
-    assert {field.name for field in fields(FusionRule)} == set(RULE_FIELDS) == set(rule)
-    signature = inspect.signature(make_fusion_params).parameters
-    defaults = {name: parameter.default for name, parameter in signature.items() if name != "classes"}
-    assert params == defaults
-
-
-def test_the_defaults_of_the_plane_are_those_of_the_functions():
-    config = asdict(PlaneConfig())
-    labeller = inspect.signature(make_plane_labeller).parameters
-    fit = inspect.signature(fit_plane_mlesac).parameters
-    known = {
-        name: parameter.default
-        for name, parameter in {**fit, **labeller}.items()
-        if parameter.default is not inspect.Parameter.empty
-    }
-    assert config == known
-
-
 def test_every_setting_has_a_default_and_says_what_it_is():
     sections = ("grid", "depth", "stereo", "fusion", "plane", "deeplab", "ensemble")
-    for kind in (MapConfig, GridConfig, FusionConfig, PlaneConfig, DeeplabConfig, StereoOptions, EnsembleOptions):
-        source = inspect.getsource(kind)
+    kinds = (GridOptions, DepthOptions, FusionOptions, PlaneOptions, DeeplabOptions, StereoOptions, EnsembleOptions)
+    for kind in (MapConfig, *kinds):
+        source = "".join(inspect.getsource(one) for one in kind.__mro__ if is_dataclass(one))
         for field in fields(kind):
             assert field.default is not MISSING or field.default_factory is not MISSING, field.name
             assert field.name in sections or f"    {field.name}: " in source
-        described = len(re.findall(r'^    """\S', source, re.MULTILINE)) - 1
+        described = len(re.findall(r'^    \w+: .*\n    """\S', source, re.MULTILINE))
         told_apart = sum(field.name in sections for field in fields(kind))
         assert described == len(fields(kind)) - told_apart, kind.__name__
 
@@ -168,6 +130,19 @@ def test_every_fault_is_named_by_its_key(tree, named):
     assert "mine.yaml" in str(caught.value)
 
 
+def test_options_check_themselves_however_they_are_made():
+    with pytest.raises(UsageError, match=r"fusion.occupancy_miss is 0\.5: .* less than or equal to 0"):
+        FusionOptions(occupancy_miss=0.5)
+    with pytest.raises(UsageError, match=r"fusion.class_prior.1 is 1\.0"):
+        replace(FusionOptions(), class_prior=(0.5, 1.0))
+    with pytest.raises(UsageError, match="unknown key plane.hypothesis_count"):
+        PlaneOptions(hypothesis_count=3)
+    with pytest.raises(UsageError, match="oak is not one of the classes sand rock in fusion.priority_classes"):
+        FusionOptions(priority_classes=("oak",)).rule(("sand", "rock"))
+    assert FusionOptions().rule(("sand", "gravel")).priority_classes == ()
+    assert FusionOptions(per_frame="sum").rule(ROVER_CLASSES) == FusionRule("sum", priority_classes=("rock",))
+
+
 def test_a_file_may_hold_nothing(tmp_path):
     (tmp_path / "empty.yaml").write_text("# nothing\n")
     assert load_config(str(tmp_path / "empty.yaml")) == MapConfig()
@@ -181,8 +156,7 @@ def test_yaml_runs_no_code(tmp_path):
 
 
 def test_the_params_of_a_config_are_what_it_says():
-    params, _ = split_fusion(load_config("chiodini2020").fusion, ROVER_CLASSES)
-    made = make_fusion_params(("background", "sand", "rock"), **params)
+    made = make_fusion_params(("background", "sand", "rock"), load_config("chiodini2020").fusion)
     np.testing.assert_allclose(made.class_increments, 0.9 * np.eye(3), atol=1e-7)
     np.testing.assert_allclose(made.class_prior, 0, atol=1e-7)
     np.testing.assert_allclose(made.class_threshold, 0.7)

@@ -25,8 +25,9 @@ from jaxmap.models.deeplab import initial_weights
 from jaxmap.training.options import AugmentationOptions, OptimiserOptions, TrainingOptions
 from jaxmap.training.step import parted
 from jaxmap.tuning.frame_crops import FrameBatch
-from jaxmap.tuning.map_loss import LossOptions, MapTruth
+from jaxmap.tuning.map_loss import MapTruth
 from jaxmap.tuning.map_step import SHOWN, MapTrainer, Site, anchor_loss, make_map_trainer
+from jaxmap.tuning.options import MapLossOptions
 from jaxmap.types import make_grid
 
 EVERY_PX = 2
@@ -58,7 +59,7 @@ def make_site() -> Site:
         SAND: MapTruth(shares, jnp.asarray(~rock, jnp.float32), known),
         ROCK: MapTruth(shares, jnp.asarray(rock, jnp.float32), known),
     }
-    losses = {SAND: LossOptions(), ROCK: LossOptions(class_weight=4.0)}
+    losses = {SAND: MapLossOptions(), ROCK: MapLossOptions(class_weight=4.0)}
     fusion = make_fusion_params(ROVER_CLASSES)
     return Site(CAMERA, GRID, (0.3, 4.5), fusion, FusionRule(), truths, losses)
 

@@ -18,14 +18,16 @@ from jaxmap.datasets.label_raster import OTHER, TARGET
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import CellGrid
 from jaxmap.evaluation.truth_cells import TruthCells, cell_counts
+from jaxmap.fusion.bijectors import positive
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
-from jaxmap.tuning.descent import DescentOptions, descend
-from jaxmap.tuning.parametrisation import TunedParams, to_free, to_legal
+from jaxmap.tuning.descent import descend
+from jaxmap.tuning.options import DescentOptions
+from jaxmap.tuning.parametrisation import TunedParams, constrained, unconstrained
 from jaxmap.tuning.split import ground_groups, hold_out
 
 CLASSES = ("background", "sand", "rock")
-LIMITS = {"temperature": (0.02, 50.0), "threshold_m": (5e-3, 1.9)}
+BIJECTORS = {"temperature": positive(0.02, 50.0), "threshold_m": positive(5e-3, 1.9)}
 START = TunedParams(
     make_fusion_params(CLASSES, class_kernel=np.pad(np.ones((3, 1, 1)), ((0, 0), (1, 1), (1, 1)))),
     {"temperature": jnp.float32(1.0), "threshold_m": jnp.float32(0.1)},
@@ -87,9 +89,9 @@ def test_options_that_make_no_sense_are_refused(wrong):
         DescentOptions(**wrong)
 
 
-def test_legal_numbers_come_back_through_their_free_ones():
-    start = to_legal(to_free(START, LIMITS), LIMITS)
-    again = to_legal(to_free(start, LIMITS), LIMITS)
+def test_parameters_come_back_through_their_unconstrained_numbers():
+    start = constrained(unconstrained(START, BIJECTORS), BIJECTORS)
+    again = constrained(unconstrained(start, BIJECTORS), BIJECTORS)
     for one, other in zip(jax.tree.leaves(start), jax.tree.leaves(again), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)
     # The defaults lie at an end of one range only: the threshold is a little above the prior.
@@ -102,10 +104,10 @@ def test_legal_numbers_come_back_through_their_free_ones():
 
 
 @given(st.integers(0, 2**20), st.sampled_from([0.1, 3.0, 100.0, 1e6]))
-def test_whatever_the_free_numbers_the_parameters_are_legal_and_ordered(seed, scale):
+def test_whatever_the_unconstrained_numbers_the_parameters_are_legal_and_ordered(seed, scale):
     rng = np.random.default_rng(seed)
     free = jax.tree.map(lambda leaf: jnp.asarray(scale * rng.normal(size=leaf.shape), jnp.float32), START)
-    legal = to_legal(free, LIMITS)
+    legal = constrained(free, BIJECTORS)
     f = {name: np.asarray(value, np.float64) for name, value in vars(legal.fusion).items()}
     sigmoid = lambda x: 1 / (1 + np.exp(-x))  # noqa: E731
     make_fusion_params(
@@ -124,7 +126,7 @@ def test_whatever_the_free_numbers_the_parameters_are_legal_and_ordered(seed, sc
     assert (kernel[:, 1, 1] == 1).all()
     np.testing.assert_allclose(kernel, kernel.transpose(0, 2, 1))
     np.testing.assert_allclose(kernel, kernel[:, ::-1])
-    for name, (low, high) in LIMITS.items():
+    for name, (low, high) in {"temperature": (0.02, 50.0), "threshold_m": (5e-3, 1.9)}.items():
         assert low * 0.999 <= float(legal.labeller[name]) <= high * 1.001
 
 

@@ -28,9 +28,9 @@ from jaxmap.tuning.evidence_cache import (
     build_cache,
     fused_evidence,
     map_of_cache,
-    tunable_labels,
+    tunable_numbers,
 )
-from jaxmap.tuning.parametrisation import TunedParams, to_free, to_legal
+from jaxmap.tuning.parametrisation import TunedParams, constrained, unconstrained
 from jaxmap.types import Frame, make_grid, make_stereo_camera
 
 CAMERA = make_stereo_camera(
@@ -81,10 +81,7 @@ def recipe_of(labeller: Labeller, rule: FusionRule) -> CacheRecipe:
 
 
 def numbers_of(recipe: CacheRecipe) -> dict[str, jax.Array]:
-    return {
-        name: jnp.asarray(value, jnp.float32)
-        for name, value in tunable_labels(recipe.labeller, recipe.rule).numbers.items()
-    }
+    return tunable_numbers(recipe.labeller, recipe.rule)
 
 
 CASES = [(name, rule) for name in LABELLERS for rule in RULES]
@@ -145,7 +142,7 @@ def doubled(tree):
 @partial(jax.jit, static_argnums=(0, 3))
 def smooth_score(name: str, free: TunedParams, kept: EvidenceCache, rule: FusionRule) -> jax.Array:
     recipe = recipe_of(LABELLERS[name], rule)
-    params = to_legal(free, tunable_labels(recipe.labeller, recipe.rule).limits)
+    params = constrained(free, recipe.labeller.bijectors)
     evidence = fused_evidence(recipe, kept, params.fusion, params.labeller)
     weight = np.random.default_rng(9).normal(size=evidence.shape)
     return (weight * jnp.tanh(evidence)).sum()
@@ -168,7 +165,7 @@ def test_gradients_equal_finite_differences(name, seed):
     recipe = recipe_of(LABELLERS[name], RULES["own"])
     rng, single = np.random.default_rng(seed), cache_of(name)
     with jax.enable_x64(True):
-        start = to_free(TunedParams(FUSION, numbers_of(recipe)), tunable_labels(recipe.labeller, recipe.rule).limits)
+        start = unconstrained(TunedParams(FUSION, numbers_of(recipe)), recipe.labeller.bijectors)
         free = jax.tree.map(lambda leaf: jnp.asarray(leaf + rng.normal(0, 0.3, leaf.shape), jnp.float64), start)
         kept = doubled(single)
         leaves, structure = jax.tree.flatten(free)
@@ -200,7 +197,7 @@ def test_gradients_equal_finite_differences(name, seed):
 def test_no_step_however_long_makes_an_illegal_or_infinite_number(name, scale, seed):
     recipe = recipe_of(LABELLERS[name], RULES["own"])
     rng = np.random.default_rng(seed)
-    start = to_free(TunedParams(FUSION, numbers_of(recipe)), tunable_labels(recipe.labeller, recipe.rule).limits)
+    start = unconstrained(TunedParams(FUSION, numbers_of(recipe)), recipe.labeller.bijectors)
     free = jax.tree.map(lambda leaf: jnp.asarray(leaf + scale * rng.normal(size=leaf.shape), jnp.float32), start)
     assert np.isfinite(smooth_score(name, free, cache_of(name), RULES["own"]))
     for leaf in jax.tree.leaves(slope_of(name, free, cache_of(name), RULES["own"])):

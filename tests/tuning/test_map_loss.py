@@ -19,8 +19,9 @@ from jaxmap.evaluation.cells import map_cells
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, make_fusion_params
 from jaxmap.fusion.query import top_down
-from jaxmap.tuning.map_loss import LossOptions, MapTruth, make_map_truth, map_loss, soft_cells
-from jaxmap.tuning.soft_view import Softness, columns_of_list, soft_columns, soft_columns_of_map
+from jaxmap.tuning.map_loss import MapTruth, make_map_truth, map_loss, soft_cells
+from jaxmap.tuning.options import MapLossOptions, Softness
+from jaxmap.tuning.soft_view import columns_of_list, soft_columns, soft_columns_of_map
 from jaxmap.types import make_grid, make_voxel_map
 
 CLASSES = truth_files.CLASSES
@@ -29,7 +30,7 @@ GRID = make_grid([0, 0, -0.4], [2.0, 1.6, 0.4], (0.1, 0.1, 0.2))
 PARAMS = make_fusion_params(CLASSES, occupancy_prior=0.4, class_prior=[0.3, 0.5, 0.2], class_threshold=0.6)
 RULES = [FusionRule(column=column, priority_classes=first) for column in ("sum", "max") for first in (("rock",), ())]
 IDS = [f"{rule.column}-{'-'.join(rule.priority_classes)}" for rule in RULES]
-HARD = LossOptions(softness=Softness(1e-4, 1e-4, 1e-4))
+HARD = MapLossOptions(softness=Softness(1e-4, 1e-4, 1e-4))
 STEP = 1e-6
 
 
@@ -88,7 +89,7 @@ def test_a_list_of_voxels_says_what_its_grid_says(rule):
 
 
 def test_the_loss_is_that_of_its_definition():
-    voxel_map, options = a_map(1), LossOptions(nll=0.7, soft_iou=0.4, class_weight=3.0)
+    voxel_map, options = a_map(1), MapLossOptions(nll_weight=0.7, iou_weight=0.4, class_weight=3.0)
     loss, parts = map_loss(voxel_map, PARAMS, RULES[0], TRUTH, ROCK, options)
     columns = soft_columns_of_map(voxel_map, PARAMS, RULES[0], ROCK, options.softness)
     said = soft_cells(columns, TRUTH.shares, jax.nn.sigmoid(PARAMS.class_prior[ROCK]), options)
@@ -129,7 +130,7 @@ def doubled(tree):
 @partial(jax.jit, static_argnums=3)
 def loss_of(params: FusionParams, log_odds: jax.Array, truth: MapTruth, rule: FusionRule) -> jax.Array:
     voxel_map = replace(make_voxel_map(GRID, CLASSES), log_odds=log_odds)
-    return map_loss(voxel_map, params, rule, truth, ROCK, LossOptions(softness=Softness(0.5, 0.5, 0.1)))[0]
+    return map_loss(voxel_map, params, rule, truth, ROCK, MapLossOptions(softness=Softness(0.5, 0.5, 0.1)))[0]
 
 
 slopes = jax.jit(jax.grad(loss_of, argnums=(0, 1)), static_argnums=3)
