@@ -16,6 +16,7 @@ FLOORS = {
     "jaxmap.types": 0,
     "jaxmap.labels": 0,
     "jaxmap.files": 0,
+    "jaxmap.cache": 0,
     "jaxmap.prefetch": 0,
     "jaxmap.precision": 0,
     "jaxmap.stages": 0,
@@ -49,7 +50,6 @@ FLOORS = {
     "jaxmap.training_config": 6,
     "jaxmap.tuning_config": 6,
     "jaxmap.config": 6,
-    "jaxmap.cache": 6,
     "jaxmap.host_memory": 6,
     "jaxmap.profiling": 6,
     # 7: runs
