@@ -148,7 +148,8 @@ def _try_out(path: str) -> tuple[str | None, bool]:
     lines = [line.strip() for line in done.stderr.decode(errors="replace").splitlines() if line.strip()] or [
         "no message"
     ]
-    message = lines[-1] if lines[0].startswith("Traceback") else lines[0]
+    # Without the addresses, which differ from time to time.
+    message = re.sub(r"0x[0-9a-f]+:? ?", "", lines[-1] if lines[0].startswith("Traceback") else lines[0])
     end = f"exit status {done.returncode}"
     if done.returncode < 0:
         end = f"killed by {signal.Signals(-done.returncode).name}"

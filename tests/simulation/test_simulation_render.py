@@ -17,22 +17,20 @@ from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.simulation.camera_rig import loccam, scaled, undistorted_pixels
 from jaxmap.simulation.lighting import Lighting, sky_irradiance
+from jaxmap.simulation.llvm import working_llvm
 from jaxmap.simulation.materials import Textures
 from jaxmap.simulation.mesh import Mesh, Surface, join, make_mesh
 from jaxmap.simulation.orthomosaic import Raster, ground_truth_labels, raster_heights_m, raster_rays, surface_labels
 from jaxmap.simulation.render import Renderer
-from jaxmap.simulation.tracer import load_mitsuba
+
+pytest.importorskip("mitsuba", reason="Mitsuba is not installed: pip install 'jaxmap[sim]'")
+try:
+    working_llvm()
+except JaxmapError as error:
+    pytest.skip(str(error), allow_module_level=True)
 
 PLAIN = Textures(np.zeros((4, 4, 5), np.float32), np.zeros((4, 4, 3), np.float32), np.zeros((4, 4, 4, 4), np.float32))
 RASTER = Raster(-2.0, 2.0, 0.1, (40, 40))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _tracer():
-    try:
-        load_mitsuba()
-    except JaxmapError as error:
-        pytest.skip(str(error))
 
 
 def lighting(sun_elevation_deg: float = 90.0, sun: float = 2.0, sky: float = 1.0) -> Lighting:
