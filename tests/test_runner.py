@@ -25,7 +25,7 @@ def test_a_test_that_dies_and_one_that_hangs_end_the_run_with_their_names(tmp_pa
     settings = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(tmp_path), "-p", "no:cacheprovider"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *options.split(), *settings, "-o", "faulthandler_timeout=1", str(tmp_path)],
+        [sys.executable, "-m", "pytest", *options.split(), *settings, "-o", "faulthandler_timeout=2", str(tmp_path)],
         capture_output=True,
         text=True,
         timeout=120,
