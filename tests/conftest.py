@@ -1,13 +1,30 @@
-"""Settings of the whole suite: hypothesis profiles, checked annotations, `--all`, the recorded data."""
+"""Settings of the whole suite: hypothesis profiles, checked annotations, `--all`, compiled programs, recorded data."""
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
+import resource
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
+
+# One cache folder for all processes of a run, and for the next run; never the user's. JAX knows its programs by what
+# they are compiled from, by its version and by its flags. `--cache-clear` empties it.
+CACHE = Path(__file__).resolve().parents[1] / ".pytest_cache" / "d" / "jaxmap"
+MOST_CACHED_BYTES = 2 << 30
+os.environ["JAXMAP_CACHE"] = str(CACHE)
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
+# Small programs, too: a test compiles dozens of them.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 # `types`, `fusion.params` and `models.deeplab` stay out: JAX rebuilds their dataclasses with stacked arrays,
 # placeholders for leaves, and shapes without arrays.
@@ -21,7 +38,9 @@ CHECKED_MODULES = (
     "evaluation.pose_scores",
     "evaluation.segmentation_scores",
     "geometry",
-    "labellers.deeplab", "labellers.files", "labellers.plane",
+    "labellers.deeplab",
+    "labellers.files",
+    "labellers.plane",
     "labels",
     "localisation",
     "mapping.step",
@@ -39,6 +58,55 @@ settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="run the tests marked slow, too")
+
+
+PEAK = pytest.StashKey[tuple[float, str]]()
+PEAKS = pytest.StashKey[dict[str, tuple[float, str]]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[PEAK] = (0.0, "")
+    config.stash[PEAKS] = {}
+    if not is_worker(config):
+        size = sum(path.stat().st_size for path in CACHE.rglob("*") if path.is_file())
+        if size > MOST_CACHED_BYTES:
+            shutil.rmtree(CACHE, ignore_errors=True)
+
+
+def is_worker(config: pytest.Config) -> bool:
+    return hasattr(config, "workerinput")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Gives back what the programs of a test file hold, hundreds of MB, and notes the peak."""
+    yield
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    if peak_mb > request.config.stash[PEAK][0]:
+        request.config.stash[PEAK] = (peak_mb, request.node.nodeid)
+    if (jax := sys.modules.get("jax")) is not None:
+        jax.clear_caches()
+        gc.collect()
+        # The C library keeps what is freed in pieces, unless it is asked.
+        with suppress(AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if is_worker(session.config):
+        session.config.workeroutput["peak"] = session.config.stash[PEAK]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    if (peak := getattr(node, "workeroutput", {}).get("peak")) is not None:
+        node.config.stash[PEAKS][node.gateway.id] = peak
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    terminalreporter.section("peak resident memory")
+    for name, (peak_mb, file) in sorted((config.stash[PEAKS] or {"main": config.stash[PEAK]}).items()):
+        terminalreporter.write_line(f"{name}: {peak_mb:.0f} MB, in {file}")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

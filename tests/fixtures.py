@@ -6,7 +6,6 @@ Import them by name into a test module. They are made once for the whole session
 from __future__ import annotations
 
 import importlib
-import os
 import re
 import shutil
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from scenes import write_folder_sequence
 
 from jaxmap.commands import COMMANDS
 from jaxmap.commands.main import main
+from jaxmap.host.cache import cache_folder
 
 FRAMES = 6
 
@@ -47,9 +47,9 @@ Run = Callable[..., Outcome]
 
 
 @pytest.fixture(scope="session", autouse=True)
-def shared_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Compiled programs are kept here, for this process and those it starts; never in the user's cache."""
-    return _cache_folder(tmp_path_factory.getbasetemp())
+def shared_cache() -> Path:
+    """Compiled programs are kept here, for all processes of a run; never in the user's cache."""
+    return cache_folder()
 
 
 @pytest.fixture(scope="session")
@@ -115,13 +115,6 @@ def options_of(command: str) -> frozenset[str]:
 def map_words(sequence: object, out: object, *more: object) -> list[str]:
     """The command line that maps the scene."""
     return [str(word) for word in ("map", sequence, "--out", out, *GRID, *more)]
-
-
-@cache
-def _cache_folder(base: Path) -> Path:
-    folder = base / "jaxmap_cache"
-    os.environ["JAXMAP_CACHE"] = str(folder)
-    return folder
 
 
 @cache

@@ -52,6 +52,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _traverse(arguments: SimulateArguments) -> int:
+    from jaxmap.simulation.tracer import load_mitsuba
     from jaxmap.simulation.traverse import TraverseOptions, simulate_traverse
 
     options = TraverseOptions(
@@ -65,7 +66,8 @@ def _traverse(arguments: SimulateArguments) -> int:
         fine_m=0.05 if arguments.preview else 0.015,
     )
     console = Console()
-    _tell_variant(console)
+    # A machine that cannot render is refused before a world is made.
+    load_mitsuba()
     with console.steps("rendering", "frames", options.frames) as advance:
         pair_s = simulate_traverse(arguments.out, options, console.notify, advance)
     if pair_s:
@@ -75,6 +77,7 @@ def _traverse(arguments: SimulateArguments) -> int:
 
 
 def _training(arguments: SimulateArguments) -> int:
+    from jaxmap.simulation.tracer import load_mitsuba
     from jaxmap.simulation.training_set import TrainingOptions, simulate_training_set
 
     options = TrainingOptions(
@@ -86,20 +89,14 @@ def _training(arguments: SimulateArguments) -> int:
         samples=arguments.samples or 4,
     )
     console = Console()
-    _tell_variant(console)
+    # A machine that cannot render is refused before a world is made.
+    load_mitsuba()
     with console.steps("rendering", "images", options.images) as advance:
         image_s = simulate_training_set(arguments.out, options, advance)
     if image_s:
         console.notify(f"{image_s:.1f} s per image")
     console.result(arguments.out, ["images/", "masks/", "train.txt", "val.txt", "worlds/"])
     return 0
-
-
-def _tell_variant(console: Console) -> None:
-    from jaxmap.simulation.tracer import ADVICE, is_vectorised, load_mitsuba
-
-    if not is_vectorised(load_mitsuba()):
-        console.notify(f"LLVM's library is not there: rays are traced one by one, a hundred times slower; {ADVICE}")
 
 
 def _check(arguments: SimulateArguments) -> None:

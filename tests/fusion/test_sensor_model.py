@@ -95,7 +95,7 @@ def test_prior_is_taken_off_each_observation_as_the_standard_filter_does():
 def test_range_weight_equals_the_twin_and_falls_with_depth(camera, grid, rng):
     depth_m = np.sort(rng.uniform(0.2, 60, 64)).astype(np.float32)
     params = make_fusion_params(CLASSES, disparity_sigma_px=float(rng.uniform(0.1, 2)))
-    weight = np.asarray(weight_of(grid, depth_sigma(camera, depth_m, params.disparity_sigma_px)))
+    weight = np.asarray(weight_of(grid, depth_sigma(camera, jnp.asarray(depth_m), params.disparity_sigma_px)))
     np.testing.assert_allclose(weight, reference.range_weight(camera, grid, depth_m, params), rtol=1e-5)
     assert np.all(np.diff(weight) <= 0)
     assert np.all((weight > 0) & (weight <= 1))

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -20,16 +17,17 @@ from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.simulation.camera_rig import loccam, scaled, undistorted_pixels
 from jaxmap.simulation.lighting import Lighting, sky_irradiance
+from jaxmap.simulation.llvm import working_llvm
 from jaxmap.simulation.materials import Textures
 from jaxmap.simulation.mesh import Mesh, Surface, join, make_mesh
 from jaxmap.simulation.orthomosaic import Raster, ground_truth_labels, raster_heights_m, raster_rays, surface_labels
-from jaxmap.simulation.tracer import find_llvm, llvm_version, load_mitsuba
+from jaxmap.simulation.render import Renderer
 
-mitsuba = pytest.importorskip("mitsuba", reason="Mitsuba is not installed: pip install 'jaxmap[sim]'")
-if find_llvm() is None:
-    pytest.skip("no LLVM library: apt install libllvm19", allow_module_level=True)
-
-from jaxmap.simulation.render import Renderer  # noqa: E402
+pytest.importorskip("mitsuba", reason="Mitsuba is not installed: pip install 'jaxmap[sim]'")
+try:
+    working_llvm()
+except JaxmapError as error:
+    pytest.skip(str(error), allow_module_level=True)
 
 PLAIN = Textures(np.zeros((4, 4, 5), np.float32), np.zeros((4, 4, 3), np.float32), np.zeros((4, 4, 4, 4), np.float32))
 RASTER = Raster(-2.0, 2.0, 0.1, (40, 40))
@@ -104,53 +102,6 @@ def test_depth_of_a_camera_is_along_its_axis():
     T[2, 3] = 2.0
     hits = Renderer(quad(50, 0, Surface.SAND), PLAIN, lighting()).first_hits(camera_rays(pixels, T))
     assert hits.depth == pytest.approx(2.0, abs=1e-4)
-
-
-SCALAR = """
-import numpy as np, sys
-sys.path.insert(0, sys.argv[1])
-import test_simulation_render as t
-renderer = t.Renderer(t.quad(50, 0, t.Surface.SAND), t.PLAIN, t.lighting(45), rover=t.quad(1.0, 1.0, t.Surface.ROCK))
-renderer.place_rover(np.eye(4))
-raster = t.Raster(-1.0, 1.0, 0.25, (8, 8))
-print(t.load_mitsuba().variant(), *renderer.radiance(t.raster_rays(raster), 2, (3,)).mean(axis=2).ravel())
-"""
-
-
-def test_both_variants_see_the_same():
-    pictures = {}
-    for variant in ("llvm_ad_rgb", "scalar_rgb"):
-        environment = {**os.environ, "JAXMAP_MITSUBA_VARIANT": variant}
-        environment["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parents[2])])
-        done = subprocess.run(
-            [sys.executable, "-c", SCALAR, str(Path(__file__).parent)],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=600,
-        )
-        assert done.returncode == 0, done.stderr
-        name, *numbers = done.stdout.split()
-        assert name == variant
-        pictures[variant] = np.array(numbers, float)
-    assert pictures["llvm_ad_rgb"] == pytest.approx(pictures["scalar_rgb"], abs=1e-4)
-
-
-def test_llvm_is_found_by_version(monkeypatch):
-    assert llvm_version(Path("usr/lib/x/libLLVM.so.19.1")) == 19
-    assert llvm_version(Path("usr/lib/x/libLLVM-14.so.1")) == 14
-    assert llvm_version(Path("usr/lib/llvm-17/lib/libLLVM.so")) == 17
-    assert llvm_version(Path("usr/lib/libLLVM.so")) is None
-    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/elsewhere/libLLVM.so")
-    assert find_llvm() == "/elsewhere/libLLVM.so"
-
-
-def test_a_missing_mitsuba_says_what_to_install(monkeypatch):
-    load_mitsuba.cache_clear()
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(JaxmapError, match="pip install"):
-        load_mitsuba()
-    load_mitsuba.cache_clear()
 
 
 @pytest.fixture(scope="module")
