@@ -180,6 +180,11 @@ def test_paths_and_links_lead_somewhere():
     assert not missing, "\n".join(missing)
 
 
+def test_the_index_lists_every_page():
+    listed = set(re.findall(r"\((\w+\.md)\)", TEXTS["docs/README.md"]))
+    assert listed == {page.name for page in (ROOT / "docs").glob("*.md")} - {"README.md"}
+
+
 def anchors(text: str) -> set[str]:
     """The anchors of the headings of a page, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
