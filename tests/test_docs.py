@@ -203,6 +203,9 @@ def test_commands_options_readers_and_presets_that_are_named_exist():
         text = prose(page)
         unknown += [f"{page}: {name}" for name in re.findall(r"`jaxmap (\w+)", text) if name not in COMMANDS]
         unknown += [f"{page}: {name}" for name in named_options(text) if f'"{name}"' not in scripts and not known(name)]
+        for script, rest in re.findall(r"`python (scripts/[\w/]+\.py)([^`]*)`", text):
+            beside = "".join(path.read_text(encoding="utf8") for path in (ROOT / script).parent.glob("*.py"))
+            unknown += [f"{page}: {script} {name}" for name in named_options(rest) if f'"{name}"' not in beside]
         unknown += [
             f"{page}: config {name}"
             for name in re.findall(r"--config (\w+)(?!\w*\.)", TEXTS[page])
