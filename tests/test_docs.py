@@ -50,18 +50,23 @@ def all_lines() -> list[tuple[str, list[str]]]:
     return [(page, words) for page in PAGES for words in command_lines(page)]
 
 
-@pytest.fixture
-def workshop(tmp_path, monkeypatch) -> Path:
-    """The current folder of the examples, with the small files that they read."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def materials(tmp_path_factory) -> Path:
+    """Small files that the examples read."""
+    folder = tmp_path_factory.mktemp("materials")
     architecture = replace(jaxmap.torch_architecture("resnet18", ("sand", "rock")), head_channels=4)
-    jaxmap.save_model("model.safetensors", architecture, seeded_weights(architecture))
-    Image.fromarray(seeded_image(20, 30)).save("left.png")
-    grid = jaxmap.make_grid([0, 0, 0], [1, 1, 1], 0.5)
-    Path("runs/motorcycle").mkdir(parents=True)
-    jaxmap.save_map("runs/motorcycle/map.zarr", jaxmap.make_voxel_map(grid, ("sand",)), jaxmap.MapAttributes())
-    Path("fusion.yaml").write_text("depth: {max_m: 8}\n")
-    Path("jaxmap").symlink_to(ROOT / "jaxmap")
+    jaxmap.save_model(folder / "model.safetensors", architecture, seeded_weights(architecture))
+    Image.fromarray(seeded_image(20, 30)).save(folder / "left.png")
+    (folder / "fusion.yaml").write_text("depth: {max_m: 8}\n")
+    return folder
+
+
+@pytest.fixture
+def workshop(materials, tmp_path, monkeypatch) -> Path:
+    """The current folder of the examples."""
+    monkeypatch.chdir(tmp_path)
+    for path in (*materials.iterdir(), ROOT / "jaxmap"):
+        Path(path.name).symlink_to(path)
     return tmp_path
 
 
@@ -104,7 +109,10 @@ PRINTED = {
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
-def test_python_blocks_run(page, workshop, capsys, monkeypatch):
+def test_python_blocks_run(page, workshop, capsys):
+    grid = jaxmap.make_grid([0, 0, 0], [1, 1, 1], 0.5)
+    Path("runs/motorcycle").mkdir(parents=True)
+    jaxmap.save_map("runs/motorcycle/map.zarr", jaxmap.make_voxel_map(grid, ("sand",)), jaxmap.MapAttributes())
     registry = importlib.import_module("jaxmap.datasets.registry")
     before = dict(READERS)
     scope: dict[str, Any] = {}
@@ -138,8 +146,6 @@ Lines of other pages that could run are among these.
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNABLE)
 def test_shell_lines_on_samples_run(page, workshop, monkeypatch, capsys):
-    (workshop / "runs/motorcycle/map.zarr").rename(workshop / "elsewhere")
-    (workshop / "runs/motorcycle").rmdir()
     ran = 0
     for words in command_lines(page):
         needs_network = words[:2] == ["weights", "fetch"]
