@@ -1,51 +1,120 @@
-"""Makes docs/motorcycle.png, the first picture of the README: the Motorcycle pair and its map in 3D.
+"""Makes docs/traverse.png, the picture of the README: what the rover saw, the voxel map, and the ground truth.
 
-python scripts/readme_picture.py      (needs Chromium)
+    python scripts/readme_picture.py [RUN]
+
+RUN is a run of sample:traverse with the `OPTIONS` below; without it the traverse is mapped first, which takes a minute
+or two.
 """
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from PIL import Image
+import numpy as np
+import rasterio
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
 
+import jaxmap as jm
 from jaxmap.commands.main import main as jaxmap_main
-from jaxmap.export.voxels import occupied_voxels
-from jaxmap.report.demo_page import key_frame_row
-from jaxmap.report.html import in_3d
-from jaxmap.report.page import page
-from jaxmap.report.run_contents import read_run
+from jaxmap.datasets.samples import sample_truth
+from jaxmap.labels import class_colours
+from jaxmap.report.run_contents import RunContents, read_run
 
-PICTURE = Path(__file__).resolve().parents[1] / "docs" / "motorcycle.png"
-SIZE_PX = (1180, 1040)
-STYLE = "<style>main{padding:1rem} h2,.view3d+p{display:none} .view3d{margin-top:1rem;height:660px}</style>"
+PICTURE = Path(__file__).resolve().parents[1] / "docs" / "traverse.png"
+OPTIONS = "--labeller deeplab --depth.max-m 8 --grid.voxel-size-m 0.05 --stereo.mode hh4 --stereo.speckle-window 1000"
+FRAME = "000004"
+EYE_AZIMUTH_DEG, EYE_ELEVATION_DEG = -45.0, 33.0
+"""Where the map is seen from in 3D: from behind the rover, east by north."""
+SHADES = (0.74, 0.58, 1.0)
+"""Light on faces normal to x, y and z."""
+INK, SIZE_PX, DPI = "#222222", (1800, 720), 100
+
+
+def voxels_in_3d(run: RunContents, width_px: int) -> Image.Image:
+    """The occupied voxels in parallel projection, far faces drawn first; background (the sky) is left out."""
+    labels = np.asarray(jm.voxel_labels(run.voxel_map, run.params, run.rule))
+    solid = (labels != jm.IGNORE) & (labels != run.voxel_map.classes.index("background"))
+    origin_m, size_m = np.asarray(run.voxel_map.grid.origin_m), np.asarray(run.voxel_map.grid.voxel_size_m)
+    azimuth, elevation = np.deg2rad([EYE_AZIMUTH_DEG, EYE_ELEVATION_DEG])
+    eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    corners_m, colours = [], []
+    for axis in range(3):
+        towards = int(eye[axis] > 0)
+        beside = np.roll(np.pad(solid, 1), 1 - 2 * towards, axis)[1:-1, 1:-1, 1:-1]
+        faces = np.argwhere(solid & ~beside)
+        square = np.insert([[0, 0], [1, 0], [1, 1], [0, 1]], axis, towards, axis=1)
+        corners_m.append(origin_m + (faces[:, None] + square) * size_m)
+        colours.append(class_colours(run.voxel_map.classes)[labels[tuple(faces.T)]] * SHADES[axis])
+    corners_m, colours = np.concatenate(corners_m), np.concatenate(colours).astype(int)
+    order = np.argsort(corners_m.mean(axis=1) @ eye)
+    seen = np.stack([corners_m @ right, -(corners_m @ np.cross(eye, right))], axis=-1)[order]
+    low, high = seen.min(axis=(0, 1)), seen.max(axis=(0, 1))
+    # Drawn at twice the size, for smooth edges.
+    seen = (seen - low) * (2 * width_px / (high - low)[0])
+    picture = Image.new("RGB", (2 * width_px, int(np.ceil(seen[..., 1].max()))), "white")
+    draw = ImageDraw.Draw(picture)
+    for corners, colour in zip(seen.reshape(-1, 8).tolist(), colours[order].tolist(), strict=True):
+        draw.polygon(corners, fill=tuple(colour))
+    return picture.resize((width_px, picture.height // 2), Image.Resampling.LANCZOS)
+
+
+def read_raster(run: RunContents, name: str, bands: int | tuple[int, ...]) -> tuple[np.ndarray, tuple[float, ...]]:
+    """A raster of the sample's ground truth, and its extent in the world of the map: west, east, south, north."""
+    with rasterio.open(sample_truth() / name) as image:
+        west, south, east, north = image.bounds - np.tile(run.attributes.site_origin[:2], 2)
+        return image.read(bands).astype(float), (west, east, south, north)
+
+
+def draw(run: RunContents) -> Figure:
+    """The whole picture."""
+    width, height = SIZE_PX
+    figure = Figure((width / DPI, height / DPI), dpi=DPI, facecolor="white")
+
+    def panel(left: int, top: int, wide: int, high: int, title: str):
+        axes = figure.add_axes((left / width, 1 - (top + high) / height, wide / width, high / height))
+        axes.set_title(title, loc="left", fontsize=11, color=INK, pad=5)
+        axes.set_axis_off()
+        return axes
+
+    for top, kind, title in ((34, "left", "left image"), (392, "labels", "labels of the bundled DeepLabv3+")):
+        axes = panel(12, top, 420, 316, title)
+        axes.imshow(Image.open(run.path / "pictures" / f"{FRAME}_{kind}.png"), aspect="auto")
+    title = "voxel map of 14 stereo pairs (sand, rock; white: not observed)"
+    panel(452, 34, 980, 674, title).imshow(voxels_in_3d(run, 980), aspect="equal")
+    figure.axes[-1].set_anchor("N")
+
+    grid, top_down = run.voxel_map.grid, jm.top_down(run.voxel_map, run.params, run.rule)
+    low = np.asarray(grid.origin_m)[:2]
+    high = low + np.asarray(grid.voxel_size_m)[:2] * grid.shape[:2]
+    colours = class_colours(run.voxel_map.classes)
+    colours[jm.IGNORE] = 255
+    above = panel(1450, 34, 338, 316, "top-down map and path")
+    above.imshow(colours[np.asarray(top_down.label).T], origin="lower", extent=(low[0], high[0], low[1], high[1]))
+    path = run.trajectory_world
+    above.plot(path[:, 0], path[:, 1], color=INK, linewidth=2)
+    below = panel(1450, 392, 338, 316, "orthomosaic, true rocks outlined")
+    ground, extent = read_raster(run, "orthomosaic.tif", (1, 2, 3))
+    below.imshow(ground.mean(axis=0), cmap="gray", extent=extent)
+    rocks, extent = read_raster(run, "orthomosaic_labels.tif", 1)
+    below.contour(rocks == 2, levels=[0.5], colors=[colours[2] / 255], linewidths=1.2, extent=extent, origin="upper")
+    for axes in (above, below):
+        axes.set_xlim(low[0] + 0.8, high[0] - 0.4)
+        axes.set_ylim(low[1], high[1] - 0.4)
+    return figure
 
 
 def main() -> int:
-    """Maps the pair, opens the map in a browser, and keeps what it shows."""
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser is None:
-        print("error: there is no Chromium; install it to make the picture", file=sys.stderr)
-        return 1
+    """Maps the traverse unless a run is given, and draws it."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        options = ["--depth.max-m", "5", "--grid.voxel-size-m", "0.025", "--stereo.mode", "hh4"]
-        jaxmap_main(["map", "sample:motorcycle", "--out", str(folder / "run"), *options])
-        run = read_run(folder / "run")
-        voxels = occupied_voxels(run.voxel_map, run.params, run.rule)
-        body = STYLE + key_frame_row(run.path) + in_3d(run, voxels)
-        (folder / "page.html").write_text(page("motorcycle", body, drawn=True), encoding="utf-8")
-        flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        flags += ["--hide-scrollbars", "--virtual-time-budget=15000", f"--user-data-dir={folder / 'profile'}"]
-        flags += [f"--window-size={SIZE_PX[0]},{SIZE_PX[1]}", f"--screenshot={folder / 'shot.png'}"]
-        subprocess.run([browser, *flags, f"file://{folder / 'page.html'}"], check=True, stderr=subprocess.DEVNULL)
-        PICTURE.parent.mkdir(exist_ok=True)
-        picture = Image.open(folder / "shot.png").convert("RGB").crop((0, 0, SIZE_PX[0], 850))
-        picture.quantize(256).save(PICTURE, optimize=True)
+        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(name) / "run"
+        if len(sys.argv) == 1:
+            jaxmap_main(["map", "sample:traverse", "--out", str(folder), *OPTIONS.split()])
+        draw(read_run(folder)).savefig(Path(name) / "picture.png")
+        Image.open(Path(name) / "picture.png").convert("RGB").quantize(256).save(PICTURE, optimize=True)
     print(f"wrote {PICTURE}")
     return 0
 
