@@ -14,7 +14,7 @@ from pydantic import ConfigDict
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import Settings
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 

@@ -33,7 +33,7 @@ from jaxmap.refinement.views import View, make_view, pinhole
 from jaxmap.report.refine_page import write_refine_report
 from jaxmap.runs.evaluation import TruthOptions, read_truth
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
 

@@ -15,7 +15,7 @@ from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 
 REF = FrameRef("f000", 0.0, Path("left/f000.png"), Path("right/f000.png"))
 PLAIN = StereoFrontEnd(CAMERA, StereoOptions())
