@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmap.datasets.assemble import Reader, ReadOptions, assemble, read_pose_track
-from jaxmap.datasets.base import FrameRef, StereoSequence
-from jaxmap.datasets.calibration import data_lines, read_camera_yaml
+from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.images import first_image_size_px, list_images
-from jaxmap.datasets.pose_files import read_timestamps
-from jaxmap.datasets.poses import with_timestamps
+from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.poses import read_timestamps, with_timestamps
+from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
 from jaxmap.types import StereoCamera, make_stereo_camera
 
@@ -27,8 +27,8 @@ def recognises(folder: Path) -> bool:
 def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
     """Opens one sequence: the grey pair (cameras 0 and 1), or the colour pair (2 and 3) without it.
 
-    An image's number is its line in `times.txt` and in the poses, so that a part of the images can
-    be read. KITTI's own poses are those of camera 0; for the colour pair they are moved to camera 2.
+    An image's number is its line in `times.txt` and in the poses, so images may be missing. KITTI's own
+    poses are those of camera 0; for the colour pair they are moved to camera 2.
 
     Raises:
         JaxmapError: a file is missing or malformed, or the counts of times and poses disagree.
@@ -41,10 +41,11 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
     if options.calibration:
         camera = read_camera_yaml(options.calibration)
     else:
-        camera = _camera(P_left, P_right, first_image_size_px(frames, folder), folder / "calib.txt")
+        camera = _camera(
+            P_left, P_right, first_image_size_px((frame.left for frame in frames), folder), folder / "calib.txt"
+        )
 
-    own = absolute.parent.parent / "poses" / f"{absolute.name}.txt"
-    track = read_pose_track(options, own if own.is_file() else None, own)
+    track = read_pose_track(options, absolute.parent.parent / "poses" / f"{absolute.name}.txt")
     if track.timestamps_s is None:
         track = with_timestamps(track, times_s)
     T_camera0_left = np.eye(4)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmap.datasets.calibration import data_lines
 from jaxmap.datasets.crs import Extent, crs_text, transform_between
 from jaxmap.datasets.label_raster import OTHER, TARGET, UNLABELLED, LabelRaster
+from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
 
 SUFFIXES = (".txt", ".csv")

@@ -1,16 +1,52 @@
-"""Settings of a command: a frozen dataclass, read strictly from YAML files and plain values."""
+"""Options and settings: frozen dataclasses that check themselves, read strictly from YAML files and plain values."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, dataclass_transform
 
-from pydantic import TypeAdapter, ValidationError
+import pydantic.dataclasses
+from annotated_types import Ge, Gt, Interval
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from jaxmap.errors import UsageError
 from jaxmap.host.files import config_folder
 
 Config = TypeVar("Config")
+
+Positive = Gt(0)
+NotNegative = Ge(0)
+Probability = Interval(gt=0, lt=1)
+
+
+@dataclass_transform(frozen_default=True)
+def options(section: str) -> Callable[[type[Config]], type[Config]]:
+    """Makes a frozen dataclass whose fields are checked whenever one is made, from Python, YAML or the command line.
+
+    Args:
+        section: where it stands in a configuration; errors name its fields below it. Empty for the top.
+
+    Raises:
+        UsageError: on making one of unknown or illegal values; names them all.
+    """
+
+    def decorate(kind: type[Config]) -> type[Config]:
+        made: Any = pydantic.dataclasses.dataclass(
+            kind, frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False)
+        )
+        initialise = made.__init__
+
+        def checked(self: Any, *args: Any, **values: Any) -> None:
+            try:
+                initialise(self, *args, **values)
+            except ValidationError as error:
+                raise UsageError(_complaints(error, section), fix="see the options' bounds (--help)") from error
+
+        made.__init__ = checked
+        return made
+
+    return decorate
 
 
 class Settings(Generic[Config]):
@@ -61,23 +97,24 @@ class Settings(Generic[Config]):
         try:
             return self._adapter.validate_python(tree)
         except ValidationError as error:
-            complaints = "; ".join(_complaints(error))
-            raise UsageError(complaints, where=where, fix=f"see jaxmap {self._command} --help") from error
+            raise UsageError(_complaints(error), where=where, fix=f"see jaxmap {self._command} --help") from error
 
     def tree(self, config: Config) -> dict[str, Any]:
         """Settings as plain values, for YAML and JSON."""
         return self._adapter.dump_python(config, mode="json")
 
 
-def _complaints(error: ValidationError) -> list[str]:
-    """One clause for each fault, by its dotted key."""
+def _complaints(error: ValidationError, section: str = "") -> str:
+    """One clause for each fault, by its dotted key below the section."""
     clauses: dict[str, str] = {}
     for fault in error.errors():
         # Branches of a union appear in the location; they are not part of the key.
-        key = ".".join(str(part) for part in fault["loc"] if isinstance(part, int) or part.isidentifier())
+        parts = [section] if section else []
+        parts += [str(part) for part in fault["loc"] if isinstance(part, int) or part.isidentifier()]
+        key = ".".join(parts)
         if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
             clauses[key] = f"unknown key {key}"
         else:
             value = repr(fault["input"])
             clauses.setdefault(key, f"{key} is {value[:60]}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
-    return list(clauses.values())
+    return "; ".join(clauses.values())

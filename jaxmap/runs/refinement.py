@@ -17,9 +17,9 @@ from scipy.ndimage import map_coordinates
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.calibration import write_camera_yaml
 from jaxmap.datasets.crs import Extent, transform_between
-from jaxmap.datasets.height_raster import read_heights
 from jaxmap.datasets.label_raster import TARGET, UNLABELLED
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
+from jaxmap.datasets.rasters import read_heights
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.host.files import remove

@@ -6,22 +6,20 @@ import threading
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Interval
-from pydantic import ConfigDict
-from pydantic.dataclasses import dataclass
+from annotated_types import Ge, Interval
 
 from jaxmap.errors import FrameError, UsageError
+from jaxmap.host.settings import NotNegative, Positive, options
 
 _SUBPIXELS = 16
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
+@options("stereo")
 class StereoOptions:
     """Options of the rectification and of OpenCV's StereoSGBM; also the `stereo` node of the configuration.
 
     Raises:
-        pydantic.ValidationError: a value out of its bounds.
-        UsageError: a value that OpenCV would refuse or silently change.
+        UsageError: a value out of its bounds, or one that OpenCV would refuse or silently change.
     """
 
     alpha: Annotated[float, Interval(ge=-1, le=1)] = 0.0
@@ -30,13 +28,13 @@ class StereoOptions:
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
     min_disparity_px: int = 0
     """Smallest disparity searched."""
-    num_disparities: Annotated[int, Gt(0)] | None = None
+    num_disparities: Annotated[int, Positive] | None = None
     """Disparities searched, a multiple of 16; by default an eighth of the image width."""
-    block_size: Annotated[int, Gt(0)] = 5
+    block_size: Annotated[int, Positive] = 5
     """Edge of the matched block, odd."""
-    p1: Annotated[int, Gt(0)] | None = None
+    p1: Annotated[int, Positive] | None = None
     """Penalty for a disparity step of one; by default 8 block_size^2."""
-    p2: Annotated[int, Gt(0)] | None = None
+    p2: Annotated[int, Positive] | None = None
     """Penalty for a greater step; by default 32 block_size^2."""
     pre_filter_cap: Annotated[int, Interval(ge=15, le=63)] = 31
     """Truncation of the image gradient; OpenCV takes 15 at least."""
@@ -44,9 +42,9 @@ class StereoOptions:
     """Margin in per cent by which the best match must win."""
     left_right_max_diff_px: Annotated[int, Ge(-1)] = 1
     """Greatest difference in the left-right check; -1 turns it off."""
-    speckle_window: Annotated[int, Ge(0)] = 100
+    speckle_window: Annotated[int, NotNegative] = 100
     """Blobs of at most so many pixels are dropped; 0 turns it off."""
-    speckle_range_px: Annotated[int, Ge(0)] = 2
+    speckle_range_px: Annotated[int, NotNegative] = 2
     """Disparity step that ends a blob."""
     pad_left: bool = True
     """Match the leftmost columns too."""

@@ -6,7 +6,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.datasets.calibration import load_yaml, read_camera_yaml, read_text
+from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.text_files import load_yaml, read_text
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 from jaxmap.types import StereoCamera

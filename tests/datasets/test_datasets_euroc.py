@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.pose_files import write_tum
-from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD
+from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD, write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.datasets.geodesy import to_utm, utm_crs
+from jaxmap.datasets.crs import to_utm, utm_crs
 from jaxmap.errors import JaxmapError
 
 

@@ -9,7 +9,7 @@ import yaml
 from PIL import Image
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 
 REALDATA = Path(os.environ.get("JAXMAP_REALDATA", Path(__file__).parents[2] / ".." / "shared" / "realdata"))

@@ -13,8 +13,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.calibration import read_camera_yaml
-from jaxmap.datasets.matlab_calibration import read_matlab_calibration
-from jaxmap.datasets.matlab_objects import structs_of_objects
+from jaxmap.datasets.matlab import read_matlab_calibration, structs_of_objects
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import config_folder
 from jaxmap.stereo.rectify import make_rectifier

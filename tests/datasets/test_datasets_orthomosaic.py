@@ -9,15 +9,16 @@ from rasterio.enums import ColorInterp
 from truth_files import CRS, SITE, class_map, write_raster
 
 from jaxmap.datasets.crs import Extent
-from jaxmap.datasets.label_coding import (
+from jaxmap.datasets.label_raster import (
     DEFAULT_CODING,
     LabelCoding,
     choose_coding,
     make_coding,
     parse_coding,
     read_coding,
+    read_label_orthomosaic,
 )
-from jaxmap.datasets.orthomosaic import read_label_orthomosaic, read_picture
+from jaxmap.datasets.rasters import read_picture
 from jaxmap.datasets.rock_list import draw_rocks, find_rock_lists, read_rock_lists
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import make_cells

@@ -21,7 +21,7 @@ from rover_logs import (
 )
 from scipy.spatial.transform import Rotation
 
-from jaxmap.datasets.katwijk_files import read_gps, read_imu, read_wheels
+from jaxmap.datasets.katwijk import read_gps, read_imu, read_wheels
 from jaxmap.datasets.poses import make_pose_track, poses_at
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.pose_scores import PoseErrors, pose_errors

@@ -83,7 +83,9 @@ configs = st.builds(
         lower_m=st.none() | st.tuples(*[st.floats(-1e6, 1e6)] * 3),
         max_memory_gib=st.floats(0.1, 64),
     ),
-    stereo=st.builds(StereoOptions, alpha=st.floats(-1, 1), num_disparities=st.none() | st.integers(1, 32).map(lambda n: 16 * n)),
+    stereo=st.builds(
+        StereoOptions, alpha=st.floats(-1, 1), num_disparities=st.none() | st.integers(1, 32).map(lambda n: 16 * n)
+    ),
     fusion=st.builds(
         FusionConfig,
         per_frame=st.sampled_from(["sum", "once", "mean"]),

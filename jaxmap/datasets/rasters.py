@@ -1,4 +1,4 @@
-"""The part of a georeferenced raster that lies over a map, from any file format that GDAL knows."""
+"""The part of a georeferenced raster that lies over a map, from any file format that GDAL reads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Shaped
+from jaxtyping import Bool, Float64, Shaped, UInt8
 
 from jaxmap.datasets.crs import Extent, crs_text, extent_in
 from jaxmap.errors import JaxmapError
@@ -45,6 +45,22 @@ class RasterWindow(NamedTuple):
     notes: tuple[str, ...]
 
 
+class HeightRaster(NamedTuple):
+    """Heights with a place.
+
+    Attributes:
+        height_m: (rows, columns), NaN where there is none.
+        T_crs_pixel: affine, takes (column, row, 1) to coordinates of `crs`; pixel `i` spans `[i, i + 1)`.
+        crs: the coordinate reference system, None where it is unknown.
+        notes: what was assumed in reading it, in words.
+    """
+
+    height_m: Float64[np.ndarray, "H W"]
+    T_crs_pixel: Float64[np.ndarray, "3 3"]
+    crs: str | None
+    notes: tuple[str, ...]
+
+
 def read_window(path: Path, place: Extent, crs: str | None = None, margin: float = 0.0) -> RasterWindow:
     """Reads the pixels of a raster that lie over a place.
 
@@ -72,6 +88,51 @@ def read_window(path: Path, place: Extent, crs: str | None = None, margin: float
         bands, valid = _read(raster, window, path)
         shift = np.array([[1.0, 0, window.col_off], [0, 1, window.row_off], [0, 0, 1]])
         return RasterWindow(bands, valid, T_crs_pixel @ shift, own or place.crs, _palette(raster), notes)
+
+
+def read_heights(path: Path, place: Extent, *, crs: str | None = None, margin: float = 0.0) -> HeightRaster:
+    """Reads the part of a digital elevation model that lies over a place.
+
+    Args:
+        path: the raster, one band of heights in metres.
+        place: the extent of the map.
+        crs: the raster's system, in place of what the file says.
+        margin: how much more is read on each side of the map, in its units.
+
+    Raises:
+        JaxmapError: what `read_window` refuses, another number of bands, or no height at all.
+    """
+    window = read_window(path, place, crs, margin)
+    if len(window.bands) != 1 or window.palette is not None:
+        kind = "colours of a palette" if window.palette is not None else f"{len(window.bands)} bands"
+        raise JaxmapError(f"{kind}, one band of heights is expected", where=path, fix="give an elevation model")
+    height_m = np.where(window.valid, window.bands[0].astype(np.float64), np.nan)
+    if not np.isfinite(height_m).any():
+        raise JaxmapError("no height lies over the map", where=path, fix="check nodata and extent of the raster")
+    return HeightRaster(height_m, window.T_crs_pixel, window.crs, window.notes)
+
+
+def read_picture(
+    path: Path, place: Extent, crs: str | None = None
+) -> tuple[UInt8[np.ndarray, "H W 3"], Float64[np.ndarray, "3 3"], str | None]:
+    """Reads the part of an orthomosaic that lies over a map as RGB, with its affine and its system.
+
+    Grey becomes RGB; numbers of more than 8 bits are stretched over their middle 96 %.
+
+    Raises:
+        JaxmapError: what `read_window` refuses.
+    """
+    window = read_window(path, place, crs)
+    bands = window.bands[:3] if len(window.bands) >= 3 else np.repeat(window.bands[:1], 3, axis=0)
+    if window.palette is not None:
+        table = np.zeros((256, 3), np.uint8)
+        for value, colour in window.palette.items():
+            table[value & 255] = colour
+        bands = np.moveaxis(table[bands[0].astype(np.uint8)], -1, 0)
+    elif bands.dtype != np.uint8:
+        low, high = np.percentile(bands[:, window.valid], [2, 98]) if window.valid.any() else (0.0, 1.0)
+        bands = np.clip((np.nan_to_num(bands.astype(np.float64)) - low) / max(high - low, 1e-9) * 255, 0, 255)
+    return np.moveaxis(bands, 0, -1).astype(np.uint8), window.T_crs_pixel, window.crs
 
 
 @contextmanager
