@@ -327,8 +327,8 @@ def test_the_recorded_excerpts_are_read_whole(realdata):
     np.testing.assert_allclose(np.diff(gps.fixes.timestamps_s), 3, atol=0.01)
     np.testing.assert_allclose(np.diff(imu.timestamps_s), 0.008, atol=0.0011)
     np.testing.assert_allclose(gps.fixes.antenna_world_m[0], [595_678, 5_785_782, 6.2], atol=5)
-    assert np.linalg.norm(imu.force_body, axis=1) == pytest.approx(9.81, abs=0.1)
-    assert not wheels.turning.any()
+    assert np.linalg.norm(imu.specific_force_body_m_s2, axis=1) == pytest.approx(9.81, abs=0.1)
+    assert not wheels.rolling.any()
 
 
 @pytest.mark.realdata
