@@ -88,11 +88,11 @@ def _timed_images(folder: Path, images: list[Path], track: PoseTrack) -> tuple[l
             return images, times / _per_second(times), "times of the frames from the file names"
     if len(images) == len(track.T):
         if track.timestamps_s is None:
-            return images, np.arange(float(len(images))), "frames numbered: no times are known"
+            return images, np.arange(float(len(images))), "frames numbered 0, 1, 2 ... s, as no times are known"
         return images, track.timestamps_s, "times of the frames from the poses, one for each"
     raise JaxmapError(
-        f"no times: no {' or '.join(_TIME_FILES)}, the file names are no times, and {len(track.T)} poses are not one "
-        f"for each of {len(images)} left images",
+        f"no times: no {' or '.join(_TIME_FILES)}, the file names are not times, and there are {len(track.T)} poses "
+        f"for {len(images)} left images",
         where=folder,
         fix="write times.txt with one time in seconds per line",
     )

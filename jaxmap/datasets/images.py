@@ -146,7 +146,7 @@ def _natural_key(file: Path) -> list[tuple[int, int, str]]:
 
 def _read_pixels(path: Path) -> np.ndarray:
     """uint8 (H, W), uint8 (H, W, 3) or, for 16-bit grey, uint16 (H, W)."""
-    # A damaged file can raise nearly anything inside Pillow's decoders, so every exception is caught.
+    # On damaged files Pillow's decoders raise nearly anything.
     try:
         with Image.open(path) as image:
             image.load()
@@ -161,7 +161,7 @@ def _read_pixels(path: Path) -> np.ndarray:
     except Exception as fault:
         raise _unreadable(path, fault) from fault
     if pixels.min() < 0 or pixels.max() > 65535:
-        raise FrameError("pixels pass 16 bits", where=path, fix="store the image as 8-bit or 16-bit grey, or RGB")
+        raise FrameError("pixels exceed 16 bits", where=path, fix="store the image as 8-bit or 16-bit grey, or RGB")
     return pixels.astype(np.uint16)
 
 

@@ -92,9 +92,11 @@ def _projections(path: Path, left: int, right: int) -> tuple[np.ndarray, np.ndar
                 f"{key} is not twelve numbers", where=f"{path} line {line}", fix="restore the file"
             ) from fault
         if not np.isfinite(matrices[key]).all() or min(matrices[key][0, 0], matrices[key][1, 1]) <= 0:
-            raise JaxmapError(f"{key} is no projection", where=f"{path} line {line}", fix="restore the file")
+            raise JaxmapError(f"{key} is not a projection matrix", where=f"{path} line {line}", fix="restore the file")
         if not np.array_equal(matrices[key][[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
-            raise JaxmapError(f"{key} is no rectified camera", where=f"{path} line {line}", fix="restore the file")
+            raise JaxmapError(
+                f"{key} is not of a rectified camera", where=f"{path} line {line}", fix="restore the file"
+            )
     absent = [key for key in (f"P{left}", f"P{right}") if key not in matrices]
     if absent:
         raise JaxmapError(f"no line {' or '.join(absent)}", where=path, fix="restore the file")

@@ -12,26 +12,27 @@ from jaxtyping import Bool, Float64, Int, UInt8
 
 from jaxmap.datasets.crs import Extent
 from jaxmap.datasets.rasters import RasterWindow, read_window
+from jaxmap.datasets.text_files import load_yaml
 from jaxmap.errors import JaxmapError, UsageError
 
 UNLABELLED, OTHER, TARGET = 0, 1, 2
-"""What a pixel of the truth is: the codes of a labelled orthomosaic, with rock as the target."""
+"""Values of ground-truth pixels. They are the codes of a labelled orthomosaic whose target class is rock."""
 
 UNLABELLED_NAME = "unlabelled"
 _REST = "*"
-_TOLD = 8
+_MAX_LISTED = 8
 
 
 @dataclass(frozen=True, eq=False)
 class LabelRaster:
-    """Labels with a place.
+    """Georeferenced labels.
 
     Attributes:
         labels: `UNLABELLED`, `OTHER` or `TARGET`, (rows, columns).
         T_crs_pixel: affine, takes (column, row, 1) to coordinates of `crs`; pixel `i` spans `[i, i + 1)`.
         crs: the coordinate reference system, None where it is unknown.
-        name: the file, for texts.
-        notes: what was assumed in reading it, in words.
+        name: the file name, for messages.
+        notes: assumptions made in reading it.
     """
 
     labels: UInt8[np.ndarray, "H W"]
@@ -46,9 +47,9 @@ class LabelCoding:
     """Class names by code; a colour is the code `red << 16 | green << 8 | blue`.
 
     Attributes:
-        names: class by code; `unlabelled` for what is no ground truth.
+        names: class by code; `unlabelled` pixels are not ground truth.
         colours: whether the codes are colours.
-        rest: the class of all other codes; without it they are refused.
+        rest: the class of all other codes; if None they are refused.
     """
 
     names: Mapping[int, str]
@@ -56,12 +57,12 @@ class LabelCoding:
     rest: str | None = None
 
     def text(self) -> str:
-        """The coding in words."""
-        told = [f"{self.code_text(code)}={name}" for code, name in self.names.items()]
-        return " ".join(told + ([f"{_REST}={self.rest}"] if self.rest else []))
+        """The coding as `CODE=CLASS` words."""
+        words = [f"{self.code_text(code)}={name}" for code, name in self.names.items()]
+        return " ".join(words + ([f"{_REST}={self.rest}"] if self.rest else []))
 
     def code_text(self, code: int) -> str:
-        """A code as it is written."""
+        """A code as a user writes it."""
         return f"#{code:06x}" if self.colours else str(code)
 
 
@@ -80,19 +81,19 @@ def read_label_orthomosaic(
 ) -> LabelRaster:
     """Reads the part of a labelled orthomosaic that lies over a map.
 
-    One band of whole numbers (a palette image: its indices), or, where the coding is of colours, a palette or RGB
-    image. Nodata and transparent pixels are unlabelled.
+    The raster has one band of whole numbers (a palette image: its indices) or, if the coding is of colours, is a
+    palette or RGB image. Nodata and transparent pixels are unlabelled.
 
     Args:
         path: the raster.
         place: the extent of the map.
-        coding: what its values mean.
+        coding: the classes of its values.
         target: the class that is scored.
-        crs: the raster's system, in place of what the file says.
-        margin: how much more is read on each side of the map, in its units.
+        crs: the raster's coordinate reference system, in place of the file's own.
+        margin: added on each side of the map, in its units.
 
     Raises:
-        JaxmapError: what `read_window` refuses, another number of bands, or values without a meaning.
+        JaxmapError: what `read_window` refuses, another number of bands, or values without a class.
         UsageError: the coding does not name the target.
     """
     window = read_window(path, place, crs, margin)
@@ -104,7 +105,7 @@ def read_label_orthomosaic(
 def sample_nearest(
     image: UInt8[np.ndarray, "H W *c"], column: Float64[np.ndarray, "*s"], row: Float64[np.ndarray, "*s"]
 ) -> UInt8[np.ndarray, "*s"]:
-    """The pixels that hold given points, 0 outside the image (and where a coordinate is not finite)."""
+    """The values of the pixels that contain the points, 0 outside the image and for coordinates that are not finite."""
     height, width = image.shape[:2]
     # Tested on floats: a NaN or a huge number cast to an integer would be a valid index.
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -113,17 +114,19 @@ def sample_nearest(
 
 
 def make_coding(pairs: Mapping[object, object], where: object) -> LabelCoding:
-    """A coding from what a user wrote: numbers, `#rrggbb`, or `*` for the rest; to class names.
+    """A coding from pairs of code (a number, `#rrggbb`, or `*` for all others) and class name.
 
     Raises:
-        UsageError: a key that is no code, a value that is no name, numbers and colours mixed, or no code at all.
+        UsageError: an invalid code or name, numbers and colours mixed, or no code at all.
     """
     names: dict[int, str] = {}
     rest, colours = None, set()
     for key, value in pairs.items():
         word, name = str(key).strip(), str(value).strip()
         if not name or not isinstance(value, str | int):
-            raise UsageError(f"{word}={value} names no class", where=where, fix="write CODE=CLASS, such as 3=rock")
+            raise UsageError(
+                f"{word}={value} does not name a class", where=where, fix="write CODE=CLASS, such as 3=rock"
+            )
         if word == _REST:
             rest = name
         elif re.fullmatch(r"#[0-9a-fA-F]{6}", word):
@@ -134,10 +137,12 @@ def make_coding(pairs: Mapping[object, object], where: object) -> LabelCoding:
             colours.add(False)
         else:
             raise UsageError(
-                f"{word[:40]!r} is no code", where=where, fix="write a number, a colour as #rrggbb, or * for the rest"
+                f"{word[:40]!r} is not a code",
+                where=where,
+                fix="write a number, a colour as #rrggbb, or * for the rest",
             )
     if len(colours) != 1:
-        what = "numbers and colours are mixed" if colours else "no code is named"
+        what = "numbers and colours are mixed" if colours else "no code is given"
         raise UsageError(what, where=where, fix="write CODE=CLASS for every code, such as 0=unlabelled 1=sand 2=rock")
     return LabelCoding(names, colours.pop(), rest)
 
@@ -146,7 +151,7 @@ def parse_coding(words: Sequence[str], where: object = "--remap") -> LabelCoding
     """A coding from words such as `3=rock`.
 
     Raises:
-        UsageError: a word of another form, or what `make_coding` refuses.
+        UsageError: a word that is not `CODE=CLASS`, or what `make_coding` refuses.
     """
     pairs: dict[object, object] = {}
     for word in words:
@@ -161,26 +166,19 @@ def read_coding(path: Path) -> LabelCoding:
     """A coding from a YAML file of `CODE: CLASS`.
 
     Raises:
-        UsageError: no such file, not YAML, or what `make_coding` refuses.
+        UsageError: the file is missing or malformed, or what `make_coding` refuses.
     """
-    import yaml
-
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError("not YAML", where=path, fix="write lines such as 2: rock") from error
-    except OSError as error:
-        raise UsageError(f"cannot be read: {error.strerror}", where=path, fix="check --palette") from error
-    if not isinstance(tree, dict):
-        raise UsageError("holds no codes", where=path, fix="write lines such as 2: rock")
-    return make_coding(tree, path)
+        return make_coding(load_yaml(path), path)
+    except JaxmapError as error:
+        raise UsageError(error.what, where=error.where, fix=error.fix) from error
 
 
 def choose_coding(remap: Sequence[str], palette: Path | None, where: object = "--remap") -> LabelCoding:
-    """The coding that words (`parse_coding`) or a file (`read_coding`) give; the usual one where neither is given.
+    """The coding of `--remap` (`parse_coding`) or of the file `--palette` (`read_coding`), else the default.
 
     Raises:
-        UsageError: both are given, or what the two refuse.
+        UsageError: both are given, or what the two functions refuse.
     """
     if remap and palette is not None:
         raise UsageError("--remap and --palette exclude each other", fix="give one of them")
@@ -192,7 +190,7 @@ def choose_coding(remap: Sequence[str], palette: Path | None, where: object = "-
 def decode(
     codes: Int[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], coding: LabelCoding, target: str, where: object
 ) -> UInt8[np.ndarray, "H W"]:
-    """What each pixel is: `TARGET` where its class is `target`, `OTHER` of another class, else `UNLABELLED`.
+    """Labels of the pixels: `TARGET` for the class `target`, `OTHER` for other classes, else `UNLABELLED`.
 
     Raises:
         UsageError: the coding does not name the target.
@@ -201,7 +199,7 @@ def decode(
     named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
     if target not in named:
         raise UsageError(
-            f"the ground truth knows no class {target!r}: {coding.text()}", where=where, fix="name its code: --remap"
+            f"the ground truth has no class {target!r}: {coding.text()}", where=where, fix="name its code: --remap"
         )
     meaning = {UNLABELLED_NAME: UNLABELLED, target: TARGET}
     labels = np.full(codes.shape, UNLABELLED if coding.rest is None else meaning.get(coding.rest, OTHER), np.uint8)
@@ -213,10 +211,10 @@ def decode(
     if (unknown := valid & ~known).any():
         values, counts = np.unique(codes[unknown], return_counts=True)
         pairs = list(zip(values.tolist(), counts.tolist(), strict=True))
-        told = ", ".join(f"{coding.code_text(value)} ({count} px)" for value, count in pairs[:_TOLD])
-        more = f" and {len(pairs) - _TOLD} more" if len(pairs) > _TOLD else ""
+        listed = ", ".join(f"{coding.code_text(value)} ({count} px)" for value, count in pairs[:_MAX_LISTED])
+        more = f" and {len(pairs) - _MAX_LISTED} more" if len(pairs) > _MAX_LISTED else ""
         raise JaxmapError(
-            f"label values that mean nothing: {told}{more}; known are {coding.text()}",
+            f"label values without a class: {listed}{more}; the coding is {coding.text()}",
             where=where,
             fix="name them all (--remap 0=unlabelled 1=sand 2=rock ...), or *=unlabelled for the rest",
         )
@@ -226,9 +224,9 @@ def decode(
 def _indices(window: RasterWindow, path: Path) -> np.ndarray:
     if len(window.bands) != 1:
         raise JaxmapError(
-            f"{len(window.bands)} bands, one of labels is expected",
+            f"{len(window.bands)} bands, one band of labels is expected",
             where=path,
-            fix="give the labelled orthomosaic, or say what its colours mean: --remap '#b23c2e=rock' '*=sand'",
+            fix="give the labelled orthomosaic, or name the classes of its colours: --remap '#b23c2e=rock' '*=sand'",
         )
     values = np.where(window.valid, window.bands[0], 0)
     codes = values.astype(np.int64)
@@ -244,7 +242,7 @@ def _colours(window: RasterWindow, path: Path) -> np.ndarray:
         return lookup[np.clip(window.bands[0].astype(np.int64), 0, len(lookup) - 1)]
     if len(window.bands) != 3 or window.bands.dtype != np.uint8:
         raise JaxmapError(
-            f"{len(window.bands)} bands of {window.bands.dtype} are no colours",
+            f"{len(window.bands)} bands of {window.bands.dtype} are not colours",
             where=path,
             fix="give an RGB or palette image of 8 bits, or numbers as the codes of --remap",
         )

@@ -40,12 +40,12 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
 
     Args:
         path: the file.
-        size_px: (width, height), where the file does not say it; old ones do not.
+        size_px: (width, height), for old files, which lack it.
 
     Raises:
-        JaxmapError: no MAT file, without a stereo calibration, or with skewed pixels, which are not modelled.
+        JaxmapError: not a MAT file, without a stereo calibration, or with skewed pixels, which are not modelled.
     """
-    # Loads much that no other reader needs.
+    # Imported here: no other reader needs it.
     from scipy.io import loadmat
 
     if not path.is_file():
@@ -55,7 +55,7 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
     except NotImplementedError as fault:
         raise JaxmapError("a MAT file of version 7.3", where=path, fix="save it in MATLAB with -v7") from fault
     except Exception as fault:
-        # Damaged files raise nearly anything in the parser.
+        # On damaged files the parser raises nearly anything.
         raise JaxmapError(f"not a MAT file ({type(fault).__name__})", where=path, fix="restore the file") from fault
     for stereo in _structs(content):
         if all(isinstance(stereo.get(key), Mapping) for key in _CAMERA_KEYS) and set(_STEREO_KEYS) <= set(stereo):
@@ -137,7 +137,7 @@ def _image_size(camera: Mapping[str, Any], size_px: tuple[int, int]) -> tuple[in
 def structs_of_objects(stream: bytes, where: object) -> list[dict[str, Any]]:
     """All structs of a `__function_workspace__`, in their order: name -> array, text or None.
 
-    Arrays have their MATLAB shape; what is neither numbers nor text is None.
+    Arrays have their MATLAB shape; values that are neither numbers nor text are None.
 
     Raises:
         JaxmapError: the stream is damaged.
@@ -193,7 +193,7 @@ def _value(data: bytes, order: str, found: list[dict[str, Any]], depth: int) -> 
         for _, inner in parts[3:]:
             _value(inner, order, found, depth + 1)
     elif array_class == _STRUCT:
-        # Names lie in one text, each padded to the length that the element before it tells.
+        # The names are one text, each padded to the length in the element before it.
         width = int(np.frombuffer(parts[3][1], f"{order}i4")[0])
         text = parts[4][1]
         names = [text[at : at + width].split(b"\0")[0].decode("ascii") for at in range(0, len(text), max(width, 1))]

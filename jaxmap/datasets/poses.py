@@ -21,10 +21,10 @@ from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
 
 KNOT_TOLERANCE_S = 1e-3
-"""A time this close to a pose takes it, beyond the ends of a track and beside gaps too."""
+"""A time this close to a pose takes it, even beyond the ends of a track and beside gaps."""
 
 MAX_LOCAL_RANGE_M = 10_000.0
-"""Positions within this of zero stay as they are; float32 resolves 1 mm there."""
+"""Smaller coordinates need no site origin: float32 resolves 1 mm there."""
 
 T_Z_UP_CAMERA_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turns a camera-like world (x right, y down, z forward) into a z-up one: x to x, z to y, -y to z."""
@@ -35,13 +35,13 @@ _TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_LEAST_COLUMNS = 8, 12, 8
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """Checked poses, in the order of time. Build it with `make_pose_track`.
+    """Valid poses in the order of time; made by `make_pose_track`.
 
     Attributes:
         timestamps_s: float64 (N,), strictly increasing; None where the file carries no times (KITTI).
         T: float64 (N, 4, 4), rigid, T_world_camera or T_world_body.
         child: the frame that `T` takes into the world.
-        where: the file, for error texts.
+        where: the file, for error messages.
     """
 
     timestamps_s: np.ndarray | None
@@ -64,7 +64,7 @@ def make_pose_track(
         timestamps_s: (N,) or None.
         T: (N, 4, 4).
         child: the frame that `T` takes into the world.
-        where: the file, for error texts.
+        where: the file, for error messages.
         lines: the line of each pose in the file; without it errors count rows from 1.
 
     Raises:
@@ -102,14 +102,14 @@ def make_pose_track(
 
 
 def read_poses(path: Path) -> PoseTrack:
-    """Reads poses as TUM text, KITTI 3x4 text or EuRoC's ground-truth csv, told apart by content.
+    """Reads poses as TUM text, KITTI 3x4 text or EuRoC's ground-truth csv, recognised by content.
 
     TUM: `timestamp_s tx ty tz qx qy qz qw`. KITTI: twelve numbers, row-major 3x4, without times.
     EuRoC: comma-separated `timestamp_ns, px, py, pz, qw, qx, qy, qz, ...`, poses of the body.
-    Empty lines and lines that start with `#` are passed over.
+    Empty lines and lines that start with `#` are ignored.
 
     Raises:
-        JaxmapError: none of the three, a line of another length, a word that is no number, a
+        JaxmapError: none of the three, a line of another length, a word that is not a number, a
             quaternion whose norm is not within 1e-2 of 1, or what `make_pose_track` refuses; with
             the line.
     """
@@ -152,7 +152,7 @@ def read_timestamps(path: Path) -> Float64[np.ndarray, "N"]:
     values = _numbers([text.split() for _, text in rows], path, [line for line, _ in rows], 1)[:, 0]
     for (line, _), value in zip(rows, values, strict=True):
         if not np.isfinite(value):
-            raise JaxmapError(f"{value} is no time", where=f"{path} line {line}", fix="correct the line")
+            raise JaxmapError(f"{value} is not a time", where=f"{path} line {line}", fix="correct the line")
     return values
 
 
@@ -160,7 +160,7 @@ def parse_ns(word: str, path: Path, line: int) -> int:
     """A timestamp in whole nanoseconds.
 
     Raises:
-        JaxmapError: it is none, with the line.
+        JaxmapError: it is not one, with the line.
     """
     if not re.fullmatch(r"[0-9]{1,19}", word):
         raise JaxmapError(
@@ -201,16 +201,16 @@ def with_timestamps(track: PoseTrack, timestamps_s: Float64[np.ndarray, "N"]) ->
 def poses_at(
     track: PoseTrack, timestamps_s: Float64[np.ndarray, "M"], max_gap_s: float
 ) -> tuple[Float64[np.ndarray, "M 4 4"], Bool[np.ndarray, "M"]]:
-    """Poses at given times: translation linear, rotation along the shortest arc.
+    """Poses at given times; translation is interpolated linearly, rotation along the shortest arc.
 
     Args:
         track: poses with timestamps.
-        timestamps_s: the times asked for.
-        max_gap_s: poses further apart than this are not bridged.
+        timestamps_s: the given times.
+        max_gap_s: poses farther apart are not interpolated.
 
     Returns:
-        T: (M, 4, 4), NaN where there is no pose. At a pose's own time it is that pose, exactly.
-        has_pose: (M,), false outside the track and inside gaps, save within `KNOT_TOLERANCE_S` of a
+        T: (M, 4, 4), NaN where there is no pose. At the time of a pose it is that pose, exactly.
+        has_pose: (M,), false outside the track and inside gaps, except within `KNOT_TOLERANCE_S` of a
             pose.
 
     Raises:
@@ -244,8 +244,8 @@ def to_z_up(
     """Camera poses in a z-up world, and the transform from their own world into it.
 
     A `camera` world (KITTI's) is x right, y down, z forward: x becomes x, z becomes y, -y becomes z.
-    `auto` looks where the cameras' up axes (-y) point on average: clearly along the world's -y means
-    a camera world, all else z-up.
+    `auto` takes the world for a camera world if the mean of the cameras' up axes (-y) points clearly
+    along its -y, else for z-up.
     """
     if world == "auto":
         up_world = -T[:, :3, 1].mean(axis=0)
@@ -260,8 +260,8 @@ def split_site_origin(
     """Poses relative to a site origin, so that UTM-sized numbers never enter float32.
 
     Returns:
-        T: positions less the origin, float64.
-        site_origin: zero where all positions lie within 10 km of zero, else the first position in
+        T: with positions relative to the origin, float64.
+        site_origin: zero if all coordinates are within 10 km of zero, else the first position in
             whole metres.
     """
     positions = T[:, :3, 3]

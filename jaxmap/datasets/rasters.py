@@ -25,16 +25,16 @@ Colours = dict[int, tuple[int, int, int]]
 
 
 class RasterWindow(NamedTuple):
-    """Pixels of a raster, and where they lie.
+    """Georeferenced pixels of a raster.
 
     Attributes:
-        bands: the file's own numbers; a band of transparency is left out.
+        bands: the values as stored, without an alpha band.
         valid: pixels that are neither nodata nor transparent.
         T_crs_pixel: affine, takes (column, row, 1) of this window to coordinates of `crs`; pixel `i` spans
             `[i, i + 1)`.
-        crs: the system; None where neither the file nor the place says one.
+        crs: the coordinate reference system; None where both the file's and the map's are unknown.
         palette: RGB of the values of a palette image, or None.
-        notes: what was assumed, in words.
+        notes: assumptions made in reading it.
     """
 
     bands: Shaped[np.ndarray, "B H W"]
@@ -46,13 +46,13 @@ class RasterWindow(NamedTuple):
 
 
 class HeightRaster(NamedTuple):
-    """Heights with a place.
+    """Georeferenced heights.
 
     Attributes:
         height_m: (rows, columns), NaN where there is none.
         T_crs_pixel: affine, takes (column, row, 1) to coordinates of `crs`; pixel `i` spans `[i, i + 1)`.
         crs: the coordinate reference system, None where it is unknown.
-        notes: what was assumed in reading it, in words.
+        notes: assumptions made in reading it.
     """
 
     height_m: Float64[np.ndarray, "H W"]
@@ -62,24 +62,24 @@ class HeightRaster(NamedTuple):
 
 
 def read_window(path: Path, place: Extent, crs: str | None = None, margin: float = 0.0) -> RasterWindow:
-    """Reads the pixels of a raster that lie over a place.
+    """Reads the pixels of a raster that lie over an extent.
 
-    Where the raster or the place is of an unknown system, it is taken for that of the other if the two overlap.
+    Where the coordinate reference system of one of the two is unknown, that of the other is assumed if they overlap.
 
     Args:
         path: the file.
-        place: what is asked for.
-        crs: the raster's system, in place of what the file says.
-        margin: how much more is read on each side, in units of the place.
+        place: the extent.
+        crs: the raster's coordinate reference system, in place of the file's own.
+        margin: added on each side, in units of the extent.
 
     Raises:
-        JaxmapError: no such file, not a raster, without georeference, truncated, or elsewhere.
+        JaxmapError: the file is missing, not a raster, truncated, not georeferenced, or elsewhere.
     """
     with _opened(path) as raster:
         T_crs_pixel = np.array(raster.transform, np.float64).reshape(3, 3)
         if np.array_equal(T_crs_pixel, np.eye(3)) or abs(np.linalg.det(T_crs_pixel)) == 0:
             raise JaxmapError(
-                "the raster says not where it lies", where=path, fix="give a GeoTIFF, or a world file beside it"
+                "the raster is not georeferenced", where=path, fix="give a GeoTIFF, or a world file beside it"
             )
         own = crs or (raster.crs.to_wkt() if raster.crs else None)
         covered = _covered(T_crs_pixel, raster.width, raster.height, own)
@@ -91,13 +91,13 @@ def read_window(path: Path, place: Extent, crs: str | None = None, margin: float
 
 
 def read_heights(path: Path, place: Extent, *, crs: str | None = None, margin: float = 0.0) -> HeightRaster:
-    """Reads the part of a digital elevation model that lies over a place.
+    """Reads the part of a digital elevation model that lies over a map.
 
     Args:
         path: the raster, one band of heights in metres.
         place: the extent of the map.
-        crs: the raster's system, in place of what the file says.
-        margin: how much more is read on each side of the map, in its units.
+        crs: the raster's coordinate reference system, in place of the file's own.
+        margin: added on each side of the map, in its units.
 
     Raises:
         JaxmapError: what `read_window` refuses, another number of bands, or no height at all.
@@ -115,9 +115,9 @@ def read_heights(path: Path, place: Extent, *, crs: str | None = None, margin: f
 def read_picture(
     path: Path, place: Extent, crs: str | None = None
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Float64[np.ndarray, "3 3"], str | None]:
-    """Reads the part of an orthomosaic that lies over a map as RGB, with its affine and its system.
+    """Reads the part of an orthomosaic that lies over a map: RGB, `T_crs_pixel`, and coordinate reference system.
 
-    Grey becomes RGB; numbers of more than 8 bits are stretched over their middle 96 %.
+    Grey becomes RGB; more than 8 bits are stretched from the 2nd to the 98th percentile.
 
     Raises:
         JaxmapError: what `read_window` refuses.
@@ -149,7 +149,7 @@ def _opened(path: Path) -> Iterator[DatasetReader]:
                 yield raster
         except RasterioError as error:
             raise JaxmapError(
-                "not a readable raster: damaged, cut off or no image", where=path, fix="give a whole GeoTIFF"
+                "not a readable raster: damaged, cut off or not an image", where=path, fix="give a whole GeoTIFF"
             ) from error
 
 
@@ -160,7 +160,7 @@ def _covered(T_crs_pixel: np.ndarray, width: int, height: int, crs: str | None) 
 
 
 def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...]:
-    """What is assumed of unknown systems.
+    """Notes on an unknown coordinate reference system.
 
     Raises:
         JaxmapError: the two do not overlap.
@@ -168,8 +168,8 @@ def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...
     there = extent_in(covered, place.crs, path)
     if not there.overlaps(place):
         unknown = {
-            (False, True): "; the raster has no CRS, say it with --truth-crs",
-            (True, False): "; the map has no CRS, say it with --crs",
+            (False, True): "; the raster has no CRS, name it with --truth-crs",
+            (True, False): "; the map has no CRS, name it with --crs",
         }.get((covered.crs is not None, place.crs is not None), "; check that both are of one site")
         raise JaxmapError(
             f"the raster does not lie over the map: it reaches from {there.text()}, the map from {place.text()} "
@@ -185,7 +185,7 @@ def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...
 
 
 def _window(raster: DatasetReader, T_crs_pixel: np.ndarray, wanted: Extent) -> Window:
-    """The whole pixels that hold a box, with some to spare."""
+    """The window of whole pixels that covers a box, with a margin."""
     from rasterio.windows import Window
 
     west, south, east, north = wanted[:4]

@@ -19,7 +19,7 @@ def read_text(path: Path) -> str:
     try:
         with open(path, "rb") as file:
             data = file.read(4096)
-            # Stops here for a bag or an image given by mistake, before gigabytes are read.
+            # A bag or an image given by mistake is refused before gigabytes are read.
             if b"\0" not in data:
                 data += file.read()
     except FileNotFoundError as fault:
@@ -47,14 +47,14 @@ def data_lines(path: Path) -> list[tuple[int, str]]:
 def load_yaml(path: Path) -> dict:
     """Safe-loads a YAML file whose top level is a mapping.
 
-    OpenCV's header `%YAML:1.0`, which EuRoC's files carry and YAML does not allow, is tolerated.
+    OpenCV's header `%YAML:1.0`, invalid in YAML but present in EuRoC's files, is accepted.
 
     Raises:
-        JaxmapError: the file is missing, is not text, is malformed (with the line), or is no mapping.
+        JaxmapError: the file is missing, is not text, is malformed (with the line), or is not a mapping.
     """
     text = read_text(path)
     if text.startswith("%YAML:"):
-        # The line break stays, so that errors name the right line.
+        # The line break is kept, so that errors name the right line.
         text = "".join(text.partition("\n")[1:])
     try:
         content = yaml.safe_load(text)
@@ -65,7 +65,7 @@ def load_yaml(path: Path) -> dict:
             f"malformed YAML ({fault.problem or fault.context})", where=place, fix="correct or restore the file"
         ) from fault
     except Exception as fault:
-        # PyYAML lets ValueError, KeyError, RecursionError and others of its constructors through.
+        # PyYAML's constructors raise ValueError, KeyError, RecursionError and others.
         raise JaxmapError(f"malformed YAML ({fault})", where=path, fix="correct or restore the file") from fault
     if not isinstance(content, dict):
         raise JaxmapError("no keys and values", where=path, fix="the file must hold `key: value` lines; restore it")
@@ -73,10 +73,10 @@ def load_yaml(path: Path) -> dict:
 
 
 def number(value: object, key: str, path: Path) -> float:
-    """A number of a YAML file; text that reads as one counts, since YAML 1.1 takes `1e-3` for text.
+    """A number of a YAML file; numeric text is accepted, since YAML 1.1 reads `1e-3` as text.
 
     Raises:
-        JaxmapError: it is none; the error names the key.
+        JaxmapError: it is not a number; the error names the key.
     """
     if isinstance(value, int | float | str) and not isinstance(value, bool):
         try:
@@ -90,7 +90,7 @@ def number_list(value: object, key: str, path: Path, count: int | None = None) -
     """A list of numbers of a YAML file as float64 (count,).
 
     Raises:
-        JaxmapError: it is no list of that many numbers; the error names the key.
+        JaxmapError: it is not a list of that many numbers; the error names the key.
     """
     if not isinstance(value, list) or (count is not None and len(value) != count):
         raise JaxmapError(
@@ -105,7 +105,7 @@ def image_size(value: object, key: str, path: Path) -> tuple[int, int]:
     """A `[width, height]` of a YAML file, in pixels.
 
     Raises:
-        JaxmapError: it is none; the error names the key.
+        JaxmapError: it is not one; the error names the key.
     """
     width, height = number_list(value, key, path, count=2)
     if not (1 <= width < 2**20 and 1 <= height < 2**20) or width % 1 or height % 1:

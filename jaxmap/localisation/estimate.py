@@ -81,7 +81,7 @@ def estimate_poses(
         ) from fault
     if not track.heading_sigma_rad < MAX_HEADING_SIGMA_RAD:
         raise JaxmapError(
-            f"the heading is unobservable, as the rover hardly moves (sigma {np.degrees(track.heading_sigma_rad):.0f} deg)",
+            f"heading unobservable, the rover hardly moves (sigma {np.degrees(track.heading_sigma_rad):.0f} deg)",
             where=where,
             fix="give a recording with more of the drive, or --poses FILE",
         )

@@ -52,5 +52,5 @@ def test_zones_are_six_degrees_wide(longitude, latitude, crs):
 
 
 def test_places_off_the_earth_are_told():
-    with pytest.raises(JaxmapError, match="has no place on the map in EPSG:32631"):
+    with pytest.raises(JaxmapError, match="is outside the domain of the projection in EPSG:32631"):
         to_utm("EPSG:32631", np.array([4.4]), np.array([1e5]))

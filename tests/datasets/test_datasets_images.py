@@ -87,7 +87,7 @@ def test_missing_and_foreign_files_are_refused(tmp_path):
     with pytest.raises(FrameError, match="pixels of type F"):
         read_image(tmp_path / "float.tiff")
     Image.fromarray(np.full((3, 3), 70000, np.int32)).save(tmp_path / "int.tiff")
-    with pytest.raises(FrameError, match="pixels pass 16 bits"):
+    with pytest.raises(FrameError, match="pixels exceed 16 bits"):
         read_image(tmp_path / "int.tiff")
 
 

@@ -250,7 +250,7 @@ def test_times_are_read_one_per_line(tmp_path):
     path = tmp_path / "times.txt"
     path.write_text("# s\n0.5\n1e1\n")
     assert P.read_timestamps(path).tolist() == [0.5, 10.0]
-    for text, message in (("1\n2 3\n", "2 columns, not 1"), ("1\ninf\n", "inf is no time"), ("\n\nab\n", "line 3")):
+    for text, message in (("1\n2 3\n", "2 columns, not 1"), ("1\ninf\n", "inf is not a time"), ("\n\nab\n", "line 3")):
         path.write_text(text)
         with pytest.raises(JaxmapError, match=message):
             P.read_timestamps(path)

@@ -186,14 +186,14 @@ def test_poses_without_times_number_the_frames(tmp_path):
     sequence = open_sequence(folder, ReadOptions(poses=given))
     assert [frame.timestamp_s for frame in sequence.frames] == [0, 1, 2, 3, 4]
     np.testing.assert_array_equal(sequence.T_world_camera, track_of(5))
-    assert sequence.notes == ("frames numbered: no times are known",)
+    assert sequence.notes == ("frames numbered 0, 1, 2 ... s, as no times are known",)
 
 
 def test_counters_are_not_taken_for_times(tmp_path):
     folder = plain_folder(tmp_path, names=["000000", "000001"], times="", poses=5)
     assert refused(folder) == (
-        "no times: no times.txt or timestamps.txt, the file names are no times, and 5 poses are not one for each of 2 "
-        "left images in SOURCE; write times.txt with one time in seconds per line"
+        "no times: no times.txt or timestamps.txt, the file names are not times, and there are 5 poses for 2 left "
+        "images in SOURCE; write times.txt with one time in seconds per line"
     )
 
 
@@ -272,7 +272,7 @@ def test_names_that_mean_nothing_are_usage_errors(tmp_path):
         "there is no reader 'nuscenes' in --dataset; choose auto, kitti, euroc, folder"
     )
     assert refused(tmp_path, ReadOptions(crs="mars"), UsageError).startswith(
-        "'mars' is no coordinate reference system in --crs"
+        "'mars' is not a coordinate reference system in --crs"
     )
 
 

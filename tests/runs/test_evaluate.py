@@ -150,7 +150,7 @@ def damaged_map(run: Path) -> None:
         (("--class", "bush"), 2, "the map has no class 'bush': its classes are background sand rock"),
         (("--cell-size-m", "0"), 2, "cell_size_m is 0.0"),
         (("--max-range-m", "5"), 1, "--max-range-m needs poses.tum and metrics.json"),
-        (("--remap", "5=rock"), 1, "label values that mean nothing"),
+        (("--remap", "5=rock"), 1, "label values without a class"),
         (("--remap", "rock"), 2, "is not CODE=CLASS"),
         (("--remap", "1=sand", "--palette", "p.yaml"), 2, "exclude each other"),
         (("--truth-crs", "EPSG:1"), 1, "unknown coordinate reference system"),
