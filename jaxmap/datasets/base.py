@@ -167,21 +167,7 @@ def assemble(
             calibration's, a selection without frames or without poses.
     """
     timestamps_s = np.array([frame.timestamp_s for frame in frames], np.float64)
-    backwards = np.diff(timestamps_s, prepend=-np.inf) <= 0
-    if backwards.any():
-        row = int(np.argmax(backwards))
-        raise JaxmapError(
-            f"the time of frame {frames[row].name} ({timestamps_s[row]:.6f} s) does not come after the one before it",
-            where=where,
-            fix="correct the times of the frames",
-        )
-    width_px, height_px = first_image_size_px((frame.left for frame in frames), where)
-    if (width_px, height_px) != (camera.width_px, camera.height_px):
-        raise JaxmapError(
-            f"images are {width_px}x{height_px} px, the calibration is for {camera.width_px}x{camera.height_px} px",
-            where=where,
-            fix="give the calibration of these images",
-        )
+    _check_frames(frames, timestamps_s, camera, where)
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
     assert track.timestamps_s is not None
@@ -231,6 +217,27 @@ def assemble(
         crs=options.crs or crs,
         notes=tuple(all_notes),
     )
+
+
+def _check_frames(
+    frames: Sequence[FrameRef], timestamps_s: np.ndarray, camera: StereoCamera | StereoRig, where: object
+) -> None:
+    """Checks the order of the times, and the size of the images against the calibration."""
+    backwards = np.diff(timestamps_s, prepend=-np.inf) <= 0
+    if backwards.any():
+        row = int(np.argmax(backwards))
+        raise JaxmapError(
+            f"the time of frame {frames[row].name} ({timestamps_s[row]:.6f} s) does not come after the one before it",
+            where=where,
+            fix="correct the times of the frames",
+        )
+    width_px, height_px = first_image_size_px((frame.left for frame in frames), where)
+    if (width_px, height_px) != (camera.width_px, camera.height_px):
+        raise JaxmapError(
+            f"images are {width_px}x{height_px} px, the calibration is for {camera.width_px}x{camera.height_px} px",
+            where=where,
+            fix="give the calibration of these images",
+        )
 
 
 def _span(timestamps_s: np.ndarray) -> str:

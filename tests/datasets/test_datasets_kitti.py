@@ -84,7 +84,7 @@ def test_part_of_the_images_keep_their_own_poses(tmp_path):
     assert "1 of 4 frames have no left image" in sequence.notes
 
 
-def test_missing_files_are_told(tmp_path):
+def test_missing_files_are_reported(tmp_path):
     folder = made_sequence(tmp_path)
     (tmp_path / "poses" / "07.txt").unlink()
     message = refused(folder)
@@ -93,7 +93,7 @@ def test_missing_files_are_told(tmp_path):
     assert refused(folder) == "there is no file SEQ/times.txt; check the path"
 
 
-def test_counts_that_disagree_are_told(tmp_path):
+def test_counts_that_disagree_are_reported(tmp_path):
     folder = made_sequence(tmp_path)
     write_own_poses(tmp_path, 3)
     assert refused(folder).startswith("3 poses for 4 frames in ROOT/poses/07.txt; poses without times need")
@@ -118,7 +118,7 @@ def test_counts_that_disagree_are_told(tmp_path):
         (CALIB.replace("-4", "4"), "baseline_m is -0.5, it must be positive in SEQ/calib.txt; check the calibration"),
     ],
 )
-def test_faulty_calibration_is_told_by_line(tmp_path, calib, message):
+def test_faulty_calibration_is_reported_by_line(tmp_path, calib, message):
     folder = made_sequence(tmp_path)
     (folder / "calib.txt").write_text(calib)
     assert message in refused(folder)

@@ -151,7 +151,7 @@ def test_turning_z_up_is_rigid_and_once_is_enough(seed, count, world):
 
 @pytest.mark.parametrize("yaw_deg", [0, 90, 180, 270])
 @pytest.mark.parametrize("pitch_down_deg", [0, 18, 35])
-def test_auto_tells_a_z_up_world_from_a_camera_world(yaw_deg, pitch_down_deg):
+def test_auto_distinguishes_a_z_up_world_from_a_camera_world(yaw_deg, pitch_down_deg):
     pitched = Rotation.from_euler("x", -pitch_down_deg, degrees=True).as_matrix()
     in_camera_world = np.eye(4)[None].copy()
     in_camera_world[0, :3, :3] = Rotation.from_euler("y", yaw_deg, degrees=True).as_matrix() @ pitched
@@ -229,18 +229,18 @@ TUM = "0 1 2 3 0 0 0 1\n"
         (b"0 1 2 3 \xff\xfe 0 0 1\n", "not a text file in FILE; give a UTF-8 text file"),
     ],
 )
-def test_faulty_pose_files_are_told_by_line(tmp_path, text, message):
+def test_faulty_pose_files_are_reported_by_line(tmp_path, text, message):
     assert message in refused(tmp_path / "poses.txt", text)
 
 
-def test_a_missing_pose_file_is_told(tmp_path):
+def test_a_missing_pose_file_is_reported(tmp_path):
     with pytest.raises(JaxmapError, match=r"there is no file .*none\.tum; check the path"):
         P.read_poses(tmp_path / "none.tum")
     with pytest.raises(JaxmapError, match="cannot be read"):
         P.read_poses(tmp_path)
 
 
-def test_poses_that_cannot_be_written_are_told(tmp_path):
+def test_poses_that_cannot_be_written_are_reported(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(JaxmapError, match=r"poses\.tum"):
         P.write_tum(tmp_path / "file" / "poses.tum", np.zeros(1), np.eye(4)[None])

@@ -69,7 +69,7 @@ def test_frames_are_chosen_like_a_slice_and_share_one_world(tmp_path):
     np.testing.assert_array_equal(part.site_origin, whole.site_origin)
 
 
-def test_an_empty_selection_tells_how_many_frames_there_are(tmp_path):
+def test_an_empty_selection_reports_how_many_frames_there_are(tmp_path):
     message = refused(plain_folder(tmp_path), ReadOptions(start=5))
     assert message == "start 5, stop None, stride 1 select none of 5 frames in SOURCE; choose another range"
 
@@ -121,7 +121,7 @@ def test_poses_in_a_camera_world_are_turned_and_noted(tmp_path):
     assert len(kept.notes) == 1
 
 
-def test_missing_poses_and_poses_of_a_body_are_told(tmp_path):
+def test_missing_poses_and_poses_of_a_body_are_reported(tmp_path):
     folder = plain_folder(tmp_path, poses=0)
     assert refused(folder) == (
         "the sequence has no poses: there is no file SOURCE/poses.tum; give them with --poses FILE (TUM text, "
@@ -132,7 +132,7 @@ def test_missing_poses_and_poses_of_a_body_are_told(tmp_path):
     assert "EuRoC csv holds poses of the body, not of the camera" in refused(folder, ReadOptions(poses=csv))
 
 
-def test_missing_calibration_is_told(tmp_path):
+def test_missing_calibration_is_reported(tmp_path):
     folder = plain_folder(tmp_path)
     (folder / "camera.yaml").unlink()
     assert refused(folder) == (
@@ -140,7 +140,7 @@ def test_missing_calibration_is_told(tmp_path):
     )
 
 
-def test_images_of_another_size_than_the_calibration_are_told(tmp_path):
+def test_images_of_another_size_than_the_calibration_are_reported(tmp_path):
     folder = plain_folder(tmp_path)
     (folder / "camera.yaml").write_text(yaml.safe_dump(CAMERA | {"image_size_px": [10, 6]}))
     assert refused(folder) == (
@@ -148,7 +148,7 @@ def test_images_of_another_size_than_the_calibration_are_told(tmp_path):
     )
 
 
-def test_a_missing_right_image_is_told_when_it_is_read(tmp_path):
+def test_a_missing_right_image_is_reported_when_it_is_read(tmp_path):
     folder = plain_folder(tmp_path)
     (folder / "right" / "f1.png").unlink()
     sequence = open_sequence(folder)
@@ -197,7 +197,7 @@ def test_counters_are_not_taken_for_times(tmp_path):
     )
 
 
-def test_counts_and_orders_that_disagree_are_told(tmp_path):
+def test_counts_and_orders_that_disagree_are_reported(tmp_path):
     folder = plain_folder(tmp_path)
     (folder / "times.txt").write_text("0\n1\n")
     assert refused(folder) == "2 times for 5 left images in SOURCE/times.txt; write one line for each image"
@@ -232,7 +232,7 @@ def test_an_offset_takes_poses_of_a_body_to_the_camera(tmp_path):
     np.testing.assert_array_equal(offset.T_world_camera[2, :3, :3], T_Z_UP_CAMERA_WORLD[:3, :3])
 
 
-def test_unknown_sources_tell_what_was_looked_for(tmp_path):
+def test_unknown_sources_are_refused_with_the_known_formats(tmp_path):
     assert refused(tmp_path / "none").startswith("there is no folder SOURCE; give the folder of one sequence")
     (tmp_path / "file").write_text("")
     assert refused(tmp_path / "file").startswith("SOURCE is a file; give the folder of one sequence")
@@ -267,7 +267,7 @@ def test_options_are_checked_when_made(options):
         ReadOptions(**options)
 
 
-def test_names_that_mean_nothing_are_usage_errors(tmp_path):
+def test_unknown_names_are_usage_errors(tmp_path):
     assert refused(tmp_path, ReadOptions(dataset="nuscenes"), UsageError).startswith(
         "there is no reader 'nuscenes' in --dataset; choose auto, kitti, euroc, folder"
     )
@@ -316,7 +316,7 @@ def test_the_motorcycles_true_disparity_maps_left_to_right():
     assert np.median(difference) < 5
 
 
-def test_unknown_samples_are_told(tmp_path):
+def test_unknown_samples_are_reported(tmp_path):
     assert refused("sample:vespa") == "there is no sample 'vespa'; choose motorcycle, traverse"
     message = refused("sample:motorcycle", ReadOptions(dataset="kitti"), UsageError)
     assert message == "a sample is not read as kitti in --dataset; leave the option out"

@@ -120,7 +120,7 @@ def test_a_map_without_a_system_is_told_where_it_gets_one(cli, tmp_path):
     rock = np.zeros((4, 4), bool)
     run = write_map(tmp_path / "run", rock, ~rock, crs=None)
     outcome = cli("evaluate", run, truth_file(tmp_path))
-    assert (outcome.status, "the map has no CRS, say it with jaxmap map --crs" in outcome.error) == (1, True)
+    assert (outcome.status, "the map has no CRS, name it with jaxmap map --crs" in outcome.error) == (1, True)
 
 
 def test_the_error_map_shows_each_verdict_in_its_place(run, tmp_path):

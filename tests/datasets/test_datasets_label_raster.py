@@ -77,7 +77,7 @@ def rotated(angle_rad: float, pixel_m: float) -> tuple[np.ndarray, Affine]:
     return turned, transform
 
 
-def test_a_rotated_raster_says_the_same(tmp_path, plain):
+def test_a_rotated_raster_gives_the_same_labels(tmp_path, plain):
     labels, transform = rotated(0.5, 0.05)
     read = read_label_orthomosaic(write_raster(tmp_path / "r.tif", labels, 0, 0, 0, transform=transform), PLACE)
     there, here = shares(read), shares(plain)
@@ -88,7 +88,7 @@ def test_a_rotated_raster_says_the_same(tmp_path, plain):
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:3857"])
-def test_a_raster_of_another_system_says_the_same(tmp_path, plain, crs):
+def test_a_reprojected_raster_gives_the_same_labels(tmp_path, plain, crs):
     from rasterio.warp import calculate_default_transform, reproject
 
     fine = np.kron(blobs(), np.ones((4, 4), np.uint8))
@@ -140,7 +140,7 @@ def test_nodata_and_transparency_are_unlabelled(tmp_path, plain):
     np.testing.assert_array_equal(read_label_orthomosaic(path, PLACE).labels, plain.labels)
 
 
-def test_what_is_assumed_of_an_unknown_system_is_noted(tmp_path, plain):
+def test_assumptions_on_an_unknown_system_are_noted(tmp_path, plain):
     bare = write_raster(tmp_path / "bare.tif", blobs(), WEST, NORTH, 0.05, crs=None)
     read = read_label_orthomosaic(bare, PLACE)
     assert read.notes == ("bare.tif has no CRS: taken for the map's, EPSG:32631",)
@@ -148,11 +148,11 @@ def test_what_is_assumed_of_an_unknown_system_is_noted(tmp_path, plain):
     known = write_raster(tmp_path / "known.tif", blobs(), WEST, NORTH, 0.05)
     read = read_label_orthomosaic(known, PLACE._replace(crs=None))
     assert read.notes == ("the map has no CRS: taken for that of known.tif, EPSG:32631",)
-    told = read_label_orthomosaic(bare, PLACE, crs="EPSG:32631")
-    assert told.notes == () and told.crs == "EPSG:32631"
+    named = read_label_orthomosaic(bare, PLACE, crs="EPSG:32631")
+    assert named.notes == () and named.crs == "EPSG:32631"
 
 
-def test_faults_of_a_raster_are_told(tmp_path):
+def test_faults_of_a_raster_are_reported(tmp_path):
     labels = blobs()
     away = write_raster(tmp_path / "away.tif", labels, WEST + 500, NORTH, 0.05)
     with pytest.raises(JaxmapError, match="does not lie over the map: it reaches from 596183 to 596191 east") as e:
@@ -205,7 +205,7 @@ def test_every_cut_of_a_raster_is_one_line(tmp_path):
         (["*=rock"], "no code is given"),
     ],
 )
-def test_codings_that_mean_nothing_are_refused(words, what):
+def test_invalid_codings_are_refused(words, what):
     with pytest.raises(UsageError, match=what.replace("*", r"\*")):
         parse_coding(words)
 
@@ -280,7 +280,7 @@ def test_one_rock_alone_and_lists_of_another_system(tmp_path):
         ("1 2\n", "do not lie over the map: they reach from"),
     ],
 )
-def test_faults_of_lists_are_told(tmp_path, text, what):
+def test_faults_of_lists_are_reported(tmp_path, text, what):
     (tmp_path / "rocks.txt").write_text(text)
     with pytest.raises(JaxmapError, match=what):
         draw_rocks(read_rock_lists([tmp_path / "rocks.txt"]), PLACE)
