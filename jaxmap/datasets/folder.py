@@ -17,7 +17,7 @@ from jaxmap.errors import JaxmapError
 
 _TIME_FILES = ("times.txt", "timestamps.txt")
 
-_LEAST_UNIX_TIME_S = 1e8
+_MIN_UNIX_TIME_S = 1e8
 
 
 def recognises(folder: Path) -> bool:
@@ -84,7 +84,7 @@ def _timed_images(folder: Path, images: list[Path], track: PoseTrack) -> tuple[l
     if all(re.fullmatch(r"[0-9]+(\.[0-9]+)?", image.stem) and len(image.stem) < 40 for image in images):
         images = sorted(images, key=lambda image: float(image.stem))
         times = np.array([float(image.stem) for image in images])
-        if any("." in image.stem for image in images) or times.max() >= _LEAST_UNIX_TIME_S:
+        if any("." in image.stem for image in images) or times.max() >= _MIN_UNIX_TIME_S:
             return images, times / _per_second(times), "times of the frames from the file names"
     if len(images) == len(track.T):
         if track.timestamps_s is None:

@@ -29,8 +29,7 @@ MAX_LOCAL_RANGE_M = 10_000.0
 T_Z_UP_CAMERA_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turns a camera-like world (x right, y down, z forward) into a z-up one: x to x, z to y, -y to z."""
 
-
-_TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_LEAST_COLUMNS = 8, 12, 8
+_TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_MIN_COLUMNS = 8, 12, 8
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def read_poses(path: Path) -> PoseTrack:
     by_comma = "," in rows[0][1]
     fields = [[word.strip() for word in text.split(",")] if by_comma else text.split() for _, text in rows]
     columns = len(fields[0])
-    if by_comma and columns >= _EUROC_LEAST_COLUMNS:
+    if by_comma and columns >= _EUROC_MIN_COLUMNS:
         timestamps_s = np.array(
             [parse_ns(words[0], path, line) / 1e9 for line, words in zip(lines, fields, strict=True)]
         )
