@@ -26,7 +26,7 @@ from .models.deeplab import PureNetwork, fold_batch_norm, make_network, pure_for
 from .models.importers import import_weights
 from .runs.segmentation import Segmenter
 from .stereo.front_end import StereoFrontEnd
-from .stereo.options import StereoOptions
+from .stereo.match import StereoOptions
 from .stereo.rectify import make_stereo_rig
 from .tuning.pull_back import make_pull_back, map_gradient
 from .types import (

@@ -19,7 +19,7 @@ from jaxmap.datasets.euroc import read_rig
 from jaxmap.datasets.samples import motorcycle_disparity
 from jaxmap.evaluation.geometry_scores import depth_consistency, point_range_error, score_disparity
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 from jaxmap.stereo.rectify import make_rectifier
 
 FRAMES_APART = 5

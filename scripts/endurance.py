@@ -29,7 +29,7 @@ import yaml
 from PIL import Image
 
 from jaxmap.datasets.base import FrameRef, StereoPair
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.mapping.sequence import FusedFrame
 from jaxmap.runs.config import check_config

@@ -21,11 +21,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from rover_logs import DRIVES, START_S, drive, write_part  # noqa: E402
 
-from jaxmap.datasets.assemble import ReadOptions  # noqa: E402
-from jaxmap.datasets.katwijk import CAMERAS, open_katwijk  # noqa: E402
-from jaxmap.datasets.katwijk_rover import R_BODY_IMU  # noqa: E402
-from jaxmap.datasets.pose_files import read_poses  # noqa: E402
-from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at  # noqa: E402
+from jaxmap.datasets import ReadOptions  # noqa: E402
+from jaxmap.datasets.katwijk import CAMERAS, R_BODY_IMU, open_katwijk  # noqa: E402
+from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at, read_poses  # noqa: E402
 from jaxmap.evaluation.pose_scores import PoseErrors, pose_errors  # noqa: E402
 
 T_IMU_CAMERA = CAMERAS["loccam"].T_mount_camera

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
 from jaxmap.geometry.bounds import usable_depth

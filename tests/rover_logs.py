@@ -1,4 +1,4 @@
-"""Made-up drives of a rover, and what its sensors would record: the truth that estimated poses are held against."""
+"""Simulated drives of a rover and the recordings of its sensors: ground truth for estimated poses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ T_IMU_LOCCAM[:3, 3] = [-0.382, -0.078, 0.557]
 
 
 class Stretch(NamedTuple):
-    """A part of a drive: so long, so fast forward, so fast to the left."""
+    """A part of a drive: duration, forward speed, turn rate to the left."""
 
     seconds: float
     speed_m_s: float = 0.3
@@ -51,7 +51,7 @@ DRIVES = {
 
 @dataclass(frozen=True)
 class Sensors:
-    """How good the sensors are; the defaults are as in the recorded excerpts and a little worse."""
+    """Errors of the sensors; the defaults are a little worse than in the recorded excerpts."""
 
     gps_sigma_m: tuple[float, float, float] = (0.01, 0.01, 0.02)
     gps_every_s: float = 3.0
@@ -97,7 +97,7 @@ def drive(
     turn = smooth(np.repeat([stretch.turn_rad_s for stretch in stretches], counts), 0.25)
     times_s = np.arange(len(speed)) * STEP_S
     heading = heading_rad + np.cumsum(turn) * STEP_S
-    # The ground tilts the rover by where it is, that is by the way it went and the way it looks.
+    # The ground tilts the rover depending on the distance driven and turned.
     way = np.cumsum(np.abs(speed) + 0.3 * np.abs(turn)) * STEP_S
     ground = np.arange(0, max(way[-1], 10), 0.02)
     bumps = gaussian_filter1d(rng.normal(size=(2, len(ground))), 0.35 / 0.02, mode="wrap")
@@ -106,13 +106,13 @@ def drive(
     R = Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], axis=-1))
     along = R.apply([1.0, 0, 0]) * speed[:, None]
     across = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1) * (-centre_m * turn)[:, None]
-    # Wheels hold on to the ground, and the IMU sways above it.
+    # The wheels do not slide, and the IMU sways above the ground.
     position = np.cumsum(along + across, axis=0) * STEP_S + R.apply([0, 0, IMU_HEIGHT_M])
     return Drive(times_s, position - position[0] + SITE_UTM_M + rng.uniform(-50, 50, 3), R, speed, turn)
 
 
 def time_text(time_s: float) -> str:
-    """As the data set writes times: milliseconds without leading zeros."""
+    """A time in the data set's format: milliseconds without leading zeros."""
     milliseconds = round((START_S + time_s) * 1000)
     moment = datetime.fromtimestamp(milliseconds // 1000, UTC)
     return f"{moment:%Y_%m_%d_%H_%M_%S}_{milliseconds % 1000}"
@@ -167,7 +167,7 @@ def imu_text(truth: Drive, sensors: Sensors, rng: np.random.Generator) -> str:
     velocity = np.gradient(truth.position_m, STEP_S, axis=0)
     acceleration = gaussian_filter1d(np.gradient(velocity, STEP_S, axis=0), 5, axis=0)
     force = truth.R_world_body.inv().apply(acceleration + np.array([0, 0, 9.81]))[:-every:every]
-    # Each sample tells the mean rate of the interval around it.
+    # Each sample is the mean rate of the interval around it.
     times_s = truth.times_s[:-every:every] + STEP_S
     rate = rate @ R_BODY_IMU + sensors.gyro_bias + rng.normal(size=rate.shape) * sensors.gyro_sigma
     force = force @ R_BODY_IMU

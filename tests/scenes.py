@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.stereo.rectify import StereoRig
 
 WIDTH_PX, HEIGHT_PX = 160, 120

@@ -65,7 +65,7 @@ def main(words: Sequence[str]) -> int:
     arguments = parse(EvaluateArguments, "evaluate", words)
     _check(arguments)
 
-    from jaxmap.datasets.label_coding import choose_coding
+    from jaxmap.datasets.label_raster import choose_coding
     from jaxmap.datasets.rock_list import SIZE_CLASSES
     from jaxmap.evaluation.evaluate import ScoringOptions
     from jaxmap.host.cache import keep_compiled_programs

@@ -92,7 +92,7 @@ def main(words: Sequence[str]) -> int:
     _check(arguments)
 
     from jaxmap.datasets import ReadOptions
-    from jaxmap.datasets.label_coding import choose_coding
+    from jaxmap.datasets.label_raster import choose_coding
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.runs.evaluation import TruthOptions
     from jaxmap.runs.refinement import CALIBRATION, OUTPUTS, GroundFiles, check_apart, run_refine

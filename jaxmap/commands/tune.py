@@ -59,7 +59,7 @@ def main(words: Sequence[str]) -> int:
     config = arguments.settings
     _check(arguments, config)
 
-    from jaxmap.datasets.label_coding import choose_coding
+    from jaxmap.datasets.label_raster import choose_coding
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.host.output_folder import locked
     from jaxmap.runs.evaluation import TruthOptions

@@ -1,20 +1,8 @@
-"""Readers of stereo sequences: `open_sequence` opens a folder or a bundled sample."""
+"""Readers of stereo sequences: `open_sequence` opens a folder or a bundled sample.
 
-from jaxmap.datasets import euroc, folder, katwijk, kitti
-from jaxmap.datasets.assemble import Reader, ReadOptions
-from jaxmap.datasets.base import FrameRef, StereoPair, StereoSequence
-from jaxmap.datasets.registry import READERS, open_sequence, register
+The names are listed in `__init__.pyi`; each is imported when it is first used, so that `ReadOptions` comes without JAX.
+"""
 
-__all__ = [
-    "READERS",
-    "FrameRef",
-    "ReadOptions",
-    "Reader",
-    "StereoPair",
-    "StereoSequence",
-    "open_sequence",
-    "register",
-]
+import lazy_loader
 
-for _reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER):
-    register(_reader)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

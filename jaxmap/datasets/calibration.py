@@ -1,4 +1,4 @@
-"""Calibration files of plain folders, and safe reading of text and YAML."""
+"""The calibration file of plain folders: a rectified or a raw stereo pair, and the mounting of the camera."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import yaml
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from jaxmap.datasets.text_files import image_size, load_yaml, number, number_list
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
 from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
@@ -22,70 +23,8 @@ _RAW_OPTIONAL = ("doffs_px", "mounting")
 _RAW_CAMERA_KEYS = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
 
 
-def read_text(path: Path) -> str:
-    """The text of a UTF-8 file (a byte order mark is dropped).
-
-    Raises:
-        JaxmapError: the file is missing, cannot be read, or is not text.
-    """
-    try:
-        with open(path, "rb") as file:
-            data = file.read(4096)
-            # Stops here for a bag or an image given by mistake, before gigabytes are read.
-            if b"\0" not in data:
-                data += file.read()
-    except FileNotFoundError as fault:
-        raise JaxmapError(f"there is no file {path}", fix="check the path") from fault
-    except (OSError, ValueError) as fault:
-        raise JaxmapError(f"the file cannot be read ({fault})", where=path, fix="check the path") from fault
-    try:
-        if b"\0" in data:
-            raise ValueError("it holds zero bytes")
-        return data.decode("utf-8-sig")
-    except ValueError as fault:
-        raise JaxmapError("not a text file", where=path, fix="give a UTF-8 text file") from fault
-
-
-def data_lines(path: Path) -> list[tuple[int, str]]:
-    """The lines of a text file that are neither empty nor `#` comments, with their numbers from 1.
-
-    Raises:
-        JaxmapError: the file is missing or is not text.
-    """
-    lines = ((number, line.strip()) for number, line in enumerate(read_text(path).split("\n"), start=1))
-    return [(number, line) for number, line in lines if line and not line.startswith("#")]
-
-
-def load_yaml(path: Path) -> dict:
-    """Safe-loads a YAML file whose top level is a mapping.
-
-    OpenCV's header `%YAML:1.0`, which EuRoC's files carry and YAML does not allow, is tolerated.
-
-    Raises:
-        JaxmapError: the file is missing, is not text, is malformed (with the line), or is no mapping.
-    """
-    text = read_text(path)
-    if text.startswith("%YAML:"):
-        # The line break stays, so that errors name the right line.
-        text = "".join(text.partition("\n")[1:])
-    try:
-        content = yaml.safe_load(text)
-    except yaml.MarkedYAMLError as fault:
-        mark = fault.problem_mark or fault.context_mark
-        place = f"{path} line {mark.line + 1}" if mark else path
-        raise JaxmapError(
-            f"malformed YAML ({fault.problem or fault.context})", where=place, fix="correct or restore the file"
-        ) from fault
-    except Exception as fault:
-        # PyYAML lets ValueError, KeyError, RecursionError and others of its constructors through.
-        raise JaxmapError(f"malformed YAML ({fault})", where=path, fix="correct or restore the file") from fault
-    if not isinstance(content, dict):
-        raise JaxmapError("no keys and values", where=path, fix="the file must hold `key: value` lines; restore it")
-    return content
-
-
 def read_camera_yaml(path: Path) -> StereoCamera | StereoRig:
-    """Reads the calibration of a plain folder: rectified or raw, told apart by the keys.
+    """Reads the calibration of a plain folder: rectified or raw, depending on the keys.
 
     Rectified (`fy_px` is `fx_px` and `doffs_px`, the right principal point minus the left one, is 0
     where absent)::
@@ -110,7 +49,7 @@ def read_camera_yaml(path: Path) -> StereoCamera | StereoRig:
 
     Raises:
         JaxmapError: the file is malformed, keys are missing or unknown (all are named), a value has
-            another type, or the numbers describe no camera pair.
+            another type, or the numbers do not describe a camera pair.
     """
     content = load_yaml(path)
     if any(key in content for key in ("left", "right", "R_right_left", "t_right_left_m")):
@@ -123,9 +62,9 @@ def read_camera_yaml(path: Path) -> StereoCamera | StereoRig:
 
 
 def read_mounting(path: Path) -> Float64[np.ndarray, "4 4"]:
-    """T_nominal_camera: where the left camera sits, if otherwise than its poses assume; else identity.
+    """T_nominal_camera: where the left camera really sits in the nominal camera's frame; identity without `mounting`.
 
-    Moves poses that were derived for the nominal camera: `T_world_camera = T_world_nominal @ T_nominal_camera`::
+    It corrects poses that were derived for the nominal camera: `T_world_camera = T_world_nominal @ T_nominal_camera`::
 
         mounting:
           translation_m: [0.0, -0.02, 0.01]     # in the nominal camera frame (of the images as they lie on disk)
@@ -164,7 +103,7 @@ def write_camera_yaml(
     tree: dict[str, object] = {"image_size_px": [camera.width_px, camera.height_px]}
     if isinstance(camera, StereoCamera):
         names = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m", "doffs_px")
-        # float32 as the short decimals they stand for.
+        # The shortest decimals that give the float32 back.
         tree |= {name: float(str(np.float32(getattr(camera, name)))) for name in names}
     else:
         for side in ("left", "right"):
@@ -212,47 +151,6 @@ def _raw_rig(content: Mapping, path: Path) -> StereoRig:
 def pinhole_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> np.ndarray:
     """The 3x3 camera matrix."""
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
-
-
-def number(value: object, key: str, path: Path) -> float:
-    """A number of a YAML file; text that reads as one counts, since YAML 1.1 takes `1e-3` for text.
-
-    Raises:
-        JaxmapError: it is none; the error names the key.
-    """
-    if isinstance(value, int | float | str) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except (ValueError, OverflowError):
-            pass
-    raise JaxmapError(f"{key} is {value!r:.60}, not a number", where=path, fix=f"give {key} a number")
-
-
-def number_list(value: object, key: str, path: Path, count: int | None = None) -> np.ndarray:
-    """A list of numbers of a YAML file as float64 (count,).
-
-    Raises:
-        JaxmapError: it is no list of that many numbers; the error names the key.
-    """
-    if not isinstance(value, list) or (count is not None and len(value) != count):
-        raise JaxmapError(
-            f"{key} is not a list of {'numbers' if count is None else f'{count} numbers'}",
-            where=path,
-            fix="write it as [a, b, ...]",
-        )
-    return np.array([number(item, key, path) for item in value], np.float64)
-
-
-def image_size(value: object, key: str, path: Path) -> tuple[int, int]:
-    """A `[width, height]` of a YAML file, in pixels.
-
-    Raises:
-        JaxmapError: it is none; the error names the key.
-    """
-    width, height = number_list(value, key, path, count=2)
-    if not (1 <= width < 2**20 and 1 <= height < 2**20) or width % 1 or height % 1:
-        raise JaxmapError(f"{key} is {value}", where=path, fix="give [width, height] in whole pixels")
-    return int(width), int(height)
 
 
 def _check_keys(path: Path, sections: Sequence[tuple[str, Mapping, Sequence[str], Sequence[str]]]) -> None:

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmap.datasets.assemble import Reader, ReadOptions, assemble, read_pose_track
-from jaxmap.datasets.base import FrameRef, StereoSequence
-from jaxmap.datasets.calibration import data_lines, image_size, load_yaml, number_list, pinhole_matrix, read_camera_yaml
-from jaxmap.datasets.pose_files import parse_ns
+from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.calibration import pinhole_matrix, read_camera_yaml
+from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.poses import parse_ns
+from jaxmap.datasets.text_files import data_lines, image_size, load_yaml, number_list
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
 
@@ -26,18 +27,17 @@ def recognises(folder: Path) -> bool:
 def open_euroc(folder: Path, options: ReadOptions) -> StereoSequence:
     """Opens one recording; its images are raw, so its camera is a `StereoRig`.
 
-    The ground truth holds poses of the body (the IMU), which `T_BS` of cam0 turns into poses of the
-    left camera. Poses given as TUM text are those of the left camera already.
+    The ground truth holds poses of the body (the IMU); `T_BS` of cam0 takes them to the left camera.
+    Poses given as TUM text are already those of the left camera.
 
     Raises:
-        JaxmapError: a file is missing or malformed, the camera model is another one, or no images
+        JaxmapError: a file is missing or malformed, the camera model is not supported, or no images
             pair up.
     """
     mav0 = folder / "mav0"
     frames, dropped = _paired_frames(mav0)
     camera = read_camera_yaml(options.calibration) if options.calibration else read_rig(folder)
-    own = mav0 / "state_groundtruth_estimate0" / "data.csv"
-    track = read_pose_track(options, own if own.is_file() else None, own, allow_body=True)
+    track = read_pose_track(options, mav0 / "state_groundtruth_estimate0" / "data.csv", allow_body=True)
     return assemble(
         name=Path(os.path.abspath(folder)).name,
         dataset="euroc",
@@ -55,7 +55,7 @@ def read_rig(folder: Path) -> StereoRig:
     """The raw calibration of a recording, from the `sensor.yaml` of both cameras.
 
     Raises:
-        JaxmapError: a file is missing or malformed, the model is another one, or the sizes differ.
+        JaxmapError: a file is missing or malformed, the model is not supported, or the sizes differ.
     """
     mav0 = folder / "mav0"
     T_body_left, left = _sensor(mav0 / "cam0" / "sensor.yaml")
@@ -87,7 +87,7 @@ def _sensor(path: Path) -> tuple[np.ndarray, dict]:
         raise JaxmapError(
             f"the camera model is {model[0]} with {model[1]} distortion",
             where=path,
-            fix="only pinhole with radial-tangential is read; rectify the images and use a plain folder",
+            fix="only pinhole with radial-tangential is supported; rectify the images and use a plain folder",
         )
     pose = content["T_BS"]
     T_body_camera = number_list(pose.get("data") if isinstance(pose, dict) else pose, "T_BS.data", path, count=16)

@@ -1,4 +1,4 @@
-"""Reading images and stereo pairs, refusing what is broken.
+"""Reading images and stereo pairs; damaged files are refused.
 
 Pillow reads them: unlike OpenCV it reports a truncated file instead of filling the rest with grey.
 """
@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from jaxmap.datasets.base import FrameRef, StereoPair
 from jaxmap.errors import FrameError, JaxmapError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
@@ -30,15 +29,15 @@ def read_image(path: str | PathLike[str]) -> ImageArray:
     """Reads an image as 8-bit grey or RGB.
 
     Grey stays grey, RGB stays RGB, palettes and other colour spaces become RGB, and alpha is
-    dropped. 16-bit grey is shifted down to 8 bits from the least of 8, 10, 12, 14 or 16 bits that
-    holds its brightest pixel, because cameras store 10 and 12 bits in 16-bit files. The rotation
-    tag of a photograph is not applied: a calibration speaks of the pixels as they are stored.
+    dropped. 16-bit grey is shifted down to 8 bits from the smallest depth of 8, 10, 12, 14 or 16 bits
+    that holds its brightest pixel, because cameras store 10 and 12 bits in 16-bit files. The EXIF
+    orientation is not applied: a calibration refers to the pixels as they are stored.
 
     Returns:
         uint8 (H, W) or (H, W, 3).
 
     Raises:
-        FrameError: the file is missing, truncated, not an image, or of a pixel type that is neither.
+        FrameError: the file is missing, truncated, not an image, or of another pixel type.
     """
     pixels = _read_pixels(Path(path))
     return _to_8_bits(pixels, _significant_bits(pixels))
@@ -70,8 +69,8 @@ def as_rgb(image: ImageArray) -> UInt8[np.ndarray, "H W 3"]:
     return np.broadcast_to(image[..., None], (*image.shape, 3)) if image.ndim == 2 else image
 
 
-def read_stereo_pair(frame: FrameRef) -> StereoPair:
-    """Reads the images of one frame.
+def read_image_pair(left_path: Path, right_path: Path, where: object) -> tuple[ImageArray, ImageArray]:
+    """Reads the left and right image of a stereo pair.
 
     Where one is grey and the other RGB, both become grey (ITU-R 601 luma). Both sides of a 16-bit
     pair are shifted by the same number of bits.
@@ -79,18 +78,19 @@ def read_stereo_pair(frame: FrameRef) -> StereoPair:
     Raises:
         FrameError: an image cannot be read, or the two differ in size.
     """
-    left, right = _read_pixels(frame.left), _read_pixels(frame.right)
+    left, right = _read_pixels(left_path), _read_pixels(right_path)
     if left.shape[:2] != right.shape[:2]:
+        sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
         raise FrameError(
-            f"the left image is {_size_text(left)}, the right one {_size_text(right)}",
-            where=f"frame {frame.name} ({frame.right})",
+            f"the left image is {sizes[0]}, the right one {sizes[1]}",
+            where=where,
             fix="both images of a pair must have one size",
         )
     bits = max(_significant_bits(left), _significant_bits(right))
     left, right = _to_8_bits(left, bits), _to_8_bits(right, bits)
     if left.ndim != right.ndim:
-        left, right = _to_grey(left), _to_grey(right)
-    return StereoPair(left, right)
+        left, right = (np.array(Image.fromarray(image).convert("L")) for image in (left, right))
+    return left, right
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
@@ -106,16 +106,16 @@ def image_size_px(path: Path) -> tuple[int, int]:
         raise _unreadable(path, fault) from fault
 
 
-def first_image_size_px(frames: Iterable[FrameRef], where: object) -> tuple[int, int]:
+def first_image_size_px(left_paths: Iterable[Path], where: object) -> tuple[int, int]:
     """The (width, height) of the first left image that can be opened.
 
     Raises:
         JaxmapError: none can.
     """
     fault: FrameError | None = None
-    for frame in frames:
+    for path in left_paths:
         try:
-            return image_size_px(frame.left)
+            return image_size_px(path)
         except FrameError as error:
             fault = fault or error
     reason = f" (first: {fault.what} in {fault.where})" if fault else ""
@@ -146,7 +146,7 @@ def _natural_key(file: Path) -> list[tuple[int, int, str]]:
 
 def _read_pixels(path: Path) -> np.ndarray:
     """uint8 (H, W), uint8 (H, W, 3) or, for 16-bit grey, uint16 (H, W)."""
-    # A damaged file can raise nearly anything inside Pillow's decoders, so every exception is caught.
+    # On damaged files Pillow's decoders raise nearly anything.
     try:
         with Image.open(path) as image:
             image.load()
@@ -161,7 +161,7 @@ def _read_pixels(path: Path) -> np.ndarray:
     except Exception as fault:
         raise _unreadable(path, fault) from fault
     if pixels.min() < 0 or pixels.max() > 65535:
-        raise FrameError("pixels pass 16 bits", where=path, fix="store the image as 8-bit or 16-bit grey, or RGB")
+        raise FrameError("pixels exceed 16 bits", where=path, fix="store the image as 8-bit or 16-bit grey, or RGB")
     return pixels.astype(np.uint16)
 
 
@@ -181,11 +181,3 @@ def _significant_bits(pixels: np.ndarray) -> int:
 
 def _to_8_bits(pixels: np.ndarray, bits: int) -> np.ndarray:
     return pixels if pixels.dtype == np.uint8 else (pixels >> (bits - 8)).astype(np.uint8)
-
-
-def _to_grey(pixels: np.ndarray) -> np.ndarray:
-    return pixels if pixels.ndim == 2 else np.array(Image.fromarray(pixels).convert("L"))
-
-
-def _size_text(pixels: np.ndarray) -> str:
-    return f"{pixels.shape[1]}x{pixels.shape[0]}"

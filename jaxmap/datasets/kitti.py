@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmap.datasets.assemble import Reader, ReadOptions, assemble, read_pose_track
-from jaxmap.datasets.base import FrameRef, StereoSequence
-from jaxmap.datasets.calibration import data_lines, read_camera_yaml
+from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.images import first_image_size_px, list_images
-from jaxmap.datasets.pose_files import read_timestamps
-from jaxmap.datasets.poses import with_timestamps
+from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.poses import read_timestamps, with_timestamps
+from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
 from jaxmap.types import StereoCamera, make_stereo_camera
 
@@ -27,8 +27,8 @@ def recognises(folder: Path) -> bool:
 def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
     """Opens one sequence: the grey pair (cameras 0 and 1), or the colour pair (2 and 3) without it.
 
-    An image's number is its line in `times.txt` and in the poses, so that a part of the images can
-    be read. KITTI's own poses are those of camera 0; for the colour pair they are moved to camera 2.
+    An image's number is its line in `times.txt` and in the poses, so images may be missing. KITTI's own
+    poses are those of camera 0; for the colour pair they are moved to camera 2.
 
     Raises:
         JaxmapError: a file is missing or malformed, or the counts of times and poses disagree.
@@ -41,10 +41,11 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
     if options.calibration:
         camera = read_camera_yaml(options.calibration)
     else:
-        camera = _camera(P_left, P_right, first_image_size_px(frames, folder), folder / "calib.txt")
+        camera = _camera(
+            P_left, P_right, first_image_size_px((frame.left for frame in frames), folder), folder / "calib.txt"
+        )
 
-    own = absolute.parent.parent / "poses" / f"{absolute.name}.txt"
-    track = read_pose_track(options, own if own.is_file() else None, own)
+    track = read_pose_track(options, absolute.parent.parent / "poses" / f"{absolute.name}.txt")
     if track.timestamps_s is None:
         track = with_timestamps(track, times_s)
     T_camera0_left = np.eye(4)
@@ -91,9 +92,11 @@ def _projections(path: Path, left: int, right: int) -> tuple[np.ndarray, np.ndar
                 f"{key} is not twelve numbers", where=f"{path} line {line}", fix="restore the file"
             ) from fault
         if not np.isfinite(matrices[key]).all() or min(matrices[key][0, 0], matrices[key][1, 1]) <= 0:
-            raise JaxmapError(f"{key} is no projection", where=f"{path} line {line}", fix="restore the file")
+            raise JaxmapError(f"{key} is not a projection matrix", where=f"{path} line {line}", fix="restore the file")
         if not np.array_equal(matrices[key][[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
-            raise JaxmapError(f"{key} is no rectified camera", where=f"{path} line {line}", fix="restore the file")
+            raise JaxmapError(
+                f"{key} is not of a rectified camera", where=f"{path} line {line}", fix="restore the file"
+            )
     absent = [key for key in (f"P{left}", f"P{right}") if key not in matrices]
     if absent:
         raise JaxmapError(f"no line {' or '.join(absent)}", where=path, fix="restore the file")

@@ -1,4 +1,4 @@
-"""Labels made elsewhere: one file for each frame, named after its left image."""
+"""Labels of other programs: one file for each frame, named after its left image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class LabelFolder:
         folder: where the files lie.
         soft: whether they are probabilities.
         class_count: the number of classes.
-        labels_are: whether they lie on the raw or on the rectified pixels of the left image.
+        labels_are: whether they label the raw or the rectified pixels of the left image.
     """
 
     folder: Path
@@ -35,7 +35,7 @@ class LabelFolder:
         """The labels of one frame on its rectified pixels, as the fields of `Frame` that they fill.
 
         Raises:
-            FrameError: the file is missing or broken, of another size, or holds what is no class.
+            FrameError: the file is missing or damaged, of another size, or holds an unknown class.
         """
         path = self.folder / f"{ref.name}{'.npy' if self.soft else '.png'}"
         labels = self._read_probabilities(path) if self.soft else self._read_indices(path)
@@ -85,7 +85,7 @@ class LabelFolder:
 def open_label_folder(
     folder: Path, class_count: int, labels_are: Literal["raw", "rectified"], first_name: str
 ) -> LabelFolder:
-    """Opens a folder of labels; the first frame's file tells whether they are indices or probabilities.
+    """Opens a folder of labels: indices or probabilities, by the suffix of the first frame's file.
 
     Raises:
         JaxmapError: no such folder, or no label for the first frame.

@@ -10,15 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmap.datasets.calibration import data_lines
 from jaxmap.datasets.crs import Extent, crs_text, transform_between
 from jaxmap.datasets.label_raster import OTHER, TARGET, UNLABELLED, LabelRaster
+from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
 
 SUFFIXES = (".txt", ".csv")
 SIZE_CLASSES = ("small", "medium", "large")
 DEFAULT_DIAMETERS_M: Mapping[str, float] = {"small": 0.3, "medium": 0.6, "large": 1.0}
-"""Assumed where a list says nothing; Katwijk's files of positions name the class in their file name."""
+"""Assumed for lists without diameters; Katwijk's files of positions have the size class in their names."""
 
 HULL_MARGIN_M = 1.0
 PIXEL_M = 0.02
@@ -28,7 +28,7 @@ _SIZE_NAMES = ("diameter", "diameter_m", "size", "size_m", "footprint_m")
 
 
 class RockList(NamedTuple):
-    """Discs on the ground: centres in some coordinate reference system, diameters in metres; and what was assumed."""
+    """Discs on the ground: centres in some coordinate reference system, diameters in metres, and assumptions made."""
 
     centres: Float64[np.ndarray, "N 2"]
     diameters_m: Float64[np.ndarray, "N"]
@@ -36,20 +36,20 @@ class RockList(NamedTuple):
 
 
 def find_rock_lists(source: Path) -> list[Path]:
-    """The lists that a path means: itself, or the text files of a folder."""
+    """The lists at a path: the file itself, or the text files of a folder."""
     if source.is_dir():
         return sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
     return [source] if source.suffix.lower() in SUFFIXES else []
 
 
 def read_rock_lists(paths: Sequence[Path], diameters_m: Mapping[str, float] = DEFAULT_DIAMETERS_M) -> RockList:
-    """Reads lists of rocks, a rock a line: `x y` or `x y diameter`, by spaces, commas or semicolons.
+    """Reads lists of rocks, one rock per line: `x y` or `x y diameter`, separated by spaces, commas or semicolons.
 
-    A first line of names says which columns are which (`x`, `y`, and `diameter` or `size`). Without a diameter it is
-    that of the size class in the file's name (`small-rocks-...txt`), of the medium class where it names none.
+    A header line names the columns (`x`, `y`, and `diameter` or `size`). Without a diameter, that of the size class
+    in the file name (`small-rocks-...txt`) is taken, and that of the medium class where the name has none.
 
     Raises:
-        JaxmapError: no such file, a line of another length, a word that is no number, or no rock at all; with the line.
+        JaxmapError: a missing file, a line of another length, a word that is not a number, or no rocks; with the line.
     """
     tables, notes = [], []
     for path in paths:
@@ -65,19 +65,19 @@ def read_rock_lists(paths: Sequence[Path], diameters_m: Mapping[str, float] = DE
 
 
 def draw_rocks(rocks: RockList, place: Extent, crs: str | None = None, name: str = "rocks") -> LabelRaster:
-    """The truth that a list of rocks stands for, drawn over a map.
+    """Rasterises a list of rocks as ground truth over a map.
 
-    A disc for each rock; all else within 1 m of the convex hull of the rocks is taken for sand; beyond it nothing is
-    known.
+    Each rock is a disc; everything else within 1 m of the convex hull of the rocks is assumed to be sand; beyond it
+    pixels are unlabelled.
 
     Args:
         rocks: the list.
-        place: the extent of the map; pixels are `PIXEL_M` of its units, metres.
-        crs: the system of the list; by default that of the place.
-        name: of the list, for texts.
+        place: the extent of the map in metres; pixels have an edge of `PIXEL_M`.
+        crs: the coordinate reference system of the list; by default that of the map.
+        name: of the list, for messages.
 
     Raises:
-        JaxmapError: no rock lies near the map; the two extents are told.
+        JaxmapError: no rock lies near the map; the error names the two extents.
     """
     x, y = transform_between(crs, place.crs, name)(rocks.centres[:, 0], rocks.centres[:, 1])
     centres, radii_m = np.stack([x, y], axis=-1), rocks.diameters_m / 2
@@ -89,7 +89,7 @@ def draw_rocks(rocks: RockList, place: Extent, crs: str | None = None, name: str
             f"the rocks do not lie over the map: they reach from {covered.text()}, the map from {place.text()} "
             f"({crs_text(place.crs)})",
             where=name,
-            fix="say the system of the list with --truth-crs",
+            fix="name the system of the list with --truth-crs",
         )
     area = np.maximum([west, south], place[:2]), np.minimum([east, north], place[2:4])
     size = np.ceil((area[1] - area[0]) / PIXEL_M).astype(int)
@@ -104,7 +104,7 @@ def draw_rocks(rocks: RockList, place: Extent, crs: str | None = None, name: str
 
 
 def _read_table(path: Path) -> tuple[np.ndarray, bool]:
-    """x, y and, where the second value is true, diameters."""
+    """x, y and, where the second value is true, the diameter."""
     lines = [(line, re.split(r"[\s,;]+", text.strip(" \t\r,;"))) for line, text in data_lines(path)]
     columns = [0, 1, 2]
     if lines and not any(map(_is_number, lines[0][1])):
@@ -140,7 +140,7 @@ def _is_number(word: str) -> bool:
 
 
 def _columns(names: list[str], path: Path) -> list[int]:
-    """Where x, y and, if there is one, the diameter stand."""
+    """The columns of x, y and, if there is one, the diameter."""
     wanted = (("x",), ("y",), _SIZE_NAMES)
     found = [next((i for i, name in enumerate(names) if name in known), None) for known in wanted]
     if found[0] is None or found[1] is None:
@@ -155,7 +155,7 @@ def _outline(centres: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
     angles = np.linspace(0, 2 * np.pi, _CIRCLE_POINTS, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     points = (centres[:, None] + radii_m[:, None, None] * circle).reshape(-1, 2)
-    # Relative to their middle: on UTM numbers the hull loses digits.
+    # Relative to their mean: on UTM coordinates the hull loses digits.
     middle = points.mean(axis=0)
     return points[ConvexHull(points - middle).vertices]
 

@@ -10,12 +10,11 @@ import numpy as np
 import skimage
 from jaxtyping import Float32
 
-from jaxmap.datasets.assemble import ReadOptions, assemble
-from jaxmap.datasets.base import FrameRef, StereoSequence
+from jaxmap.datasets.base import FrameRef, StereoSequence, assemble
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.katwijk import open_katwijk
-from jaxmap.datasets.pose_files import read_poses
-from jaxmap.datasets.poses import make_pose_track
+from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.poses import make_pose_track, read_poses
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.files import bundled
 from jaxmap.types import make_stereo_camera
@@ -71,7 +70,7 @@ def _open_motorcycle(options: ReadOptions) -> StereoSequence:
 
 
 def _motorcycle_file(name: str) -> Path:
-    # Read in place: skimage.data would try to download a file that is missing.
+    # Not through skimage.data, which would try to download a missing file.
     path = Path(skimage.__file__).parent / "data" / name
     if not path.is_file():
         raise JaxmapError("the Motorcycle sample is missing", where=path, fix="reinstall scikit-image from its wheel")

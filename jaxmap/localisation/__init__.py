@@ -1,1 +1,1 @@
-"""Where a wheeled rover was: its poses from GPS, gyros, inclinometer and wheels, smoothed over a whole recording."""
+"""Poses of a wheeled rover from GPS, gyros, inclinometer and wheels, smoothed over a whole recording."""

@@ -1,4 +1,4 @@
-"""Roll and pitch: the inclinometer tells them in the mean, the gyros between."""
+"""Roll and pitch: the inclinometer measures them on average, the gyros their changes."""
 
 from __future__ import annotations
 
@@ -14,61 +14,64 @@ from jaxmap.localisation.sensors import ImuLog, in_gap, increments
 GRAVITY_M_S2 = 9.81
 
 GYRO_NOISE = 1.5e-3
-"""How the up direction strays from what the gyros say, rad per root second; with vibration and misalignment."""
+"""Random walk of the up direction integrated from the gyros, rad per root second; with vibration and misalignment."""
 
 GYRO_NOISE_IN_GAP = 0.2
-"""The same while the IMU is silent."""
+"""The same in gaps of the IMU."""
 
 FORCE_SIGMA_M_S2 = 0.2
 """Of the specific force averaged around a knot (0.1 s): mostly jolts, which last longer than a sample."""
 
 BIAS_SIGMA = 0.01
-"""Of the gyros' bias in rad/s, before anything is known."""
+"""Prior of the gyro bias in rad/s."""
 
 BIAS_DRIFT = 5e-5
-"""Of the gyros' bias, rad/s per root second."""
+"""Random walk of the gyro bias, rad/s per root second."""
 
 HUBER = 2.0
-"""Residuals beyond so many sigma pull with a constant force."""
+"""Residuals beyond so many sigma weigh less (Huber's loss)."""
 
 _UP, _BIAS = (0, 1, 2), (3, 4, 5)
 
 
-class Tilt(NamedTuple):
-    """Roll about the forward axis (positive: left side up) and pitch about the left axis (nose down), (K,) rad."""
+class RollPitch(NamedTuple):
+    """Roll about the forward axis (left side up) and pitch about the left axis (nose down), each (K,)."""
 
     roll_rad: np.ndarray
     pitch_rad: np.ndarray
 
 
-def estimate_tilt(
+def estimate_roll_pitch(
     imu: ImuLog, knots_s: Float64[np.ndarray, "K"], acceleration_body: Float64[np.ndarray, "K 3"]
-) -> Tilt:
+) -> RollPitch:
     """Roll and pitch at the knots.
 
-    Estimated is the up direction u in the body frame, which turns by `du/dt = -(rate - bias) x u`
-    and is `(force - acceleration) / g`. That is linear in u, whatever the tilt, and bilinear in the
-    bias.
+    The estimate is the up direction u in the body frame: `du/dt = -(rate - bias) x u` and
+    `u = (force - acceleration) / g`. This is linear in u, whatever the tilt, and bilinear in the bias.
 
     Args:
         imu: gyros and inclinometer.
         knots_s: times within those of the IMU.
-        acceleration_body: how the rover's speed changes, in m/s2, which the inclinometer feels as if
-            it were tilted.
+        acceleration_body: of the rover in m/s2, which the inclinometer cannot distinguish from tilt.
 
     Raises:
-        numpy.linalg.LinAlgError: the readings determine no attitude.
+        numpy.linalg.LinAlgError: the measurements do not determine the attitude.
     """
     dt = np.diff(knots_s)
-    # A vector that rests in the world turns the other way in the body.
-    turn = Rotation.from_rotvec(-increments(imu.timestamps_s, imu.rate_body, knots_s)).as_matrix()
-    measured = (_mean_around(imu, knots_s) - acceleration_body) / GRAVITY_M_S2
-    silent = in_gap(imu.timestamps_s, (knots_s[:-1] + knots_s[1:]) / 2)
-    up_sigma = np.where(silent, GYRO_NOISE_IN_GAP, GYRO_NOISE) * np.sqrt(dt)
+    # A vector fixed in the world rotates the opposite way in the body.
+    turn = Rotation.from_rotvec(-increments(imu.timestamps_s, imu.angular_rate_body_rad_s, knots_s)).as_matrix()
+    # The mean specific force from midway before each knot to midway after it.
+    edges_s = np.concatenate([knots_s[:1], (knots_s[:-1] + knots_s[1:]) / 2, knots_s[-1:]])
+    mean_force = increments(imu.timestamps_s, imu.specific_force_body_m_s2, edges_s) / np.diff(edges_s)[:, None]
+    measured = (mean_force - acceleration_body) / GRAVITY_M_S2
+    gaps = in_gap(imu.timestamps_s, (knots_s[:-1] + knots_s[1:]) / 2)
+    up_sigma = np.where(gaps, GYRO_NOISE_IN_GAP, GYRO_NOISE) * np.sqrt(dt)
+    # The inclinometer hardly weighs beside a gap.
+    force_weight = np.where(np.append(gaps, False) | np.append(False, gaps), 1e-6, 1.0)
 
     up = measured / np.maximum(np.linalg.norm(measured, axis=1, keepdims=True), 1e-9)
     bias = np.zeros_like(up)
-    huber = felt = _felt_around(silent)
+    huber = force_weight
     for _ in range(4):
         chain = ChainLeastSquares(len(knots_s), 6)
         middle = (up[:-1] + up[1:]) / 2
@@ -85,19 +88,8 @@ def estimate_tilt(
         step = chain.step()
         up, bias = up + step[:, :3], bias + step[:, 3:]
         off = np.linalg.norm(up - measured, axis=1) / (FORCE_SIGMA_M_S2 / GRAVITY_M_S2)
-        huber = felt * HUBER / np.maximum(off, HUBER)
-    return Tilt(np.arctan2(up[:, 1], up[:, 2]), np.arctan2(-up[:, 0], np.hypot(up[:, 1], up[:, 2])))
-
-
-def _felt_around(silent: np.ndarray) -> np.ndarray:
-    """Weights of the inclinometer at the knots, (K,): next to none beside a gap of the IMU, else 1."""
-    return np.where(np.append(silent, False) | np.append(False, silent), 1e-6, 1.0)
-
-
-def _mean_around(imu: ImuLog, knots_s: np.ndarray) -> np.ndarray:
-    """The mean specific force from midway before each knot to midway after it, (K, 3)."""
-    edges_s = np.concatenate([knots_s[:1], (knots_s[:-1] + knots_s[1:]) / 2, knots_s[-1:]])
-    return increments(imu.timestamps_s, imu.force_body, edges_s) / np.diff(edges_s)[:, None]
+        huber = force_weight * HUBER / np.maximum(off, HUBER)
+    return RollPitch(np.arctan2(up[:, 1], up[:, 2]), np.arctan2(-up[:, 0], np.hypot(up[:, 1], up[:, 2])))
 
 
 def _cross_matrix(vectors: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Least squares over states along a chain, where each term touches one knot or two neighbours.
 
-The normal equations are block tridiagonal, so that a banded Cholesky factorisation solves them in
-time linear in the number of knots. It gives what a Rauch-Tung-Striebel smoother gives (both are the
-maximum of the same posterior), and the terms can be written down one by one.
+The normal equations are block tridiagonal, so a banded Cholesky factorisation solves them in time
+linear in the number of knots. The result is that of a Rauch-Tung-Striebel smoother (both maximise the
+same posterior), but the terms can be written down one by one.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 Jacobian = Mapping[int, ArrayLike]
-"""State -> the derivative of a residual by it, a number or one for each residual."""
+"""State -> the derivative of the residuals by it, one number or one for each residual."""
 
 
 class ChainLeastSquares:
-    """Sums up terms `(residual / sigma)^2`, linearised, and solves for the step that makes them least.
+    """Sums linearised terms `(residual / sigma)^2` and solves for the step that minimises them.
 
     Args:
-        knots: how many there are.
-        states: how many numbers each knot holds.
+        knots: number of knots.
+        states: number of states of each knot.
     """
 
     def __init__(self, knots: int, states: int) -> None:
@@ -33,7 +33,7 @@ class ChainLeastSquares:
         self._factor: np.ndarray | None = None
 
     def at(self, knots: int | slice | np.ndarray, jacobian: Jacobian, residual: ArrayLike, sigma: ArrayLike) -> None:
-        """Adds one residual at each of some knots (an index, or an array of them without repeats)."""
+        """Adds one residual at each of the given knots (an index, or an array of indices without repeats)."""
         weight = 1.0 / np.square(sigma)
         for row, row_slope in jacobian.items():
             self._gradient[knots, row] += weight * np.multiply(row_slope, residual)
@@ -41,7 +41,7 @@ class ChainLeastSquares:
                 self._own[knots, row, column] += weight * np.multiply(row_slope, slope)
 
     def between(self, before: Jacobian, after: Jacobian, residual: ArrayLike, sigma: ArrayLike) -> None:
-        """Adds one residual between each knot and the next; `sigma` infinite leaves it out."""
+        """Adds one residual between each knot and the next; an infinite `sigma` leaves it out."""
         weight = 1.0 / np.square(sigma)
         for knots, jacobian in ((slice(None, -1), before), (slice(1, None), after)):
             for row, row_slope in jacobian.items():
@@ -53,7 +53,7 @@ class ChainLeastSquares:
                 self._next[:, row, column] += weight * np.multiply(row_slope, slope)
 
     def step(self) -> Float64[np.ndarray, "K n"]:
-        """The Gauss-Newton step from where the terms were linearised.
+        """The Gauss-Newton step from the point of linearisation.
 
         Raises:
             numpy.linalg.LinAlgError: the terms leave some state undetermined.
@@ -73,16 +73,13 @@ class ChainLeastSquares:
 
     def _solve(self, columns: np.ndarray) -> np.ndarray:
         if self._factor is None:
-            self._factor = cholesky_banded(self._banded(), lower=True)
+            knots, states = self._gradient.shape
+            # LAPACK's form of the lower half: row d, column j holds element (j + d, j).
+            banded = np.zeros((2 * states, knots, states))
+            for row in range(states):
+                for column in range(states):
+                    if row >= column:
+                        banded[row - column, :, column] = self._own[:, row, column]
+                    banded[states + row - column, :-1, column] = self._next[:, row, column]
+            self._factor = cholesky_banded(banded.reshape(2 * states, -1), lower=True)
         return cho_solve_banded((self._factor, True), columns)
-
-    def _banded(self) -> np.ndarray:
-        """The lower half in LAPACK's form: row d, column j holds element (j + d, j)."""
-        knots, states = self._gradient.shape
-        banded = np.zeros((2 * states, knots, states))
-        for row in range(states):
-            for column in range(states):
-                if row >= column:
-                    banded[row - column, :, column] = self._own[:, row, column]
-                banded[states + row - column, :-1, column] = self._next[:, row, column]
-        return banded.reshape(2 * states, -1)

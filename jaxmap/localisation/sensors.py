@@ -1,4 +1,4 @@
-"""What a rover's sensors recorded, as checked arrays.
+"""Recordings of a rover's sensors as arrays.
 
 The body frame is x forward, y left, z up, with its origin in the IMU; the world is x east, y north,
 z up. Times are seconds on one clock, strictly increasing.
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 MAX_SENSOR_GAP_S = 0.5
-"""Samples of the IMU or the wheels farther apart leave a gap, in which they tell nothing."""
+"""Samples of the IMU or the wheels farther apart leave a gap without measurement."""
 
 
 class GpsFixes(NamedTuple):
@@ -31,45 +31,45 @@ class GpsFixes(NamedTuple):
 
 
 class ImuLog(NamedTuple):
-    """What gyros and inclinometer felt.
+    """Gyros and inclinometer.
 
     Attributes:
         timestamps_s: (N,).
-        rate_body: (N, 3), angular rate in rad/s.
-        force_body: (N, 3), specific force in m/s2: upwards and 9.81 at rest.
+        angular_rate_body_rad_s: (N, 3).
+        specific_force_body_m_s2: (N, 3), upwards and 9.81 at rest.
     """
 
     timestamps_s: np.ndarray
-    rate_body: np.ndarray
-    force_body: np.ndarray
+    angular_rate_body_rad_s: np.ndarray
+    specific_force_body_m_s2: np.ndarray
 
 
 class WheelLog(NamedTuple):
-    """How fast the wheels say that the rover goes.
+    """Wheel odometry.
 
     Attributes:
         timestamps_s: (N,).
-        speed_m_s: (N,), forward positive.
-        turning: (N,), whether any wheel turns; where none does, the rover stands.
+        speed_m_s: (N,), of the rover, forward positive.
+        rolling: (N,), whether any wheel turns; where none does, the rover stands.
     """
 
     timestamps_s: np.ndarray
     speed_m_s: np.ndarray
-    turning: np.ndarray
+    rolling: np.ndarray
 
 
 @dataclass(frozen=True)
 class RoverGeometry:
-    """Where things are on the rover, in the body frame.
+    """Lever arms of the rover in the body frame.
 
-    Wheels hold on to the ground, so it is the ground under the rover, not the IMU on its swaying
-    body, that moves the way the rover looks.
+    The wheels do not slide sideways, so the ground point under the rover, not the IMU on its swaying body, moves
+    along the heading.
 
     Attributes:
         antenna_body_m: (3,), the phase centre of the GPS antenna.
-        height_m: of the IMU over the ground.
-        turning_centre_m: how far ahead of the IMU the axis lies about which the rover turns
-            (negative: behind); a first guess, which the estimate betters.
+        height_m: of the IMU above the ground.
+        turning_centre_m: distance from the IMU forward to the axis about which the rover turns (negative: behind);
+            a first guess, refined by the estimate.
     """
 
     antenna_body_m: np.ndarray
@@ -82,7 +82,7 @@ def increments(
 ) -> Float64[np.ndarray, "K-1 *C"]:
     """The integral of a sampled signal from each knot to the next; beyond its ends the signal is zero."""
     samples = values.reshape(len(values), -1)
-    # The trapezoidal rule; what scipy.integrate brings along takes a quarter of a second to import.
+    # The trapezoidal rule; scipy.integrate takes a quarter of a second to import.
     whole = np.zeros_like(samples)
     whole[1:] = np.cumsum(np.diff(timestamps_s)[:, None] * (samples[1:] + samples[:-1]) / 2, axis=0)
     columns = whole.T
@@ -91,7 +91,7 @@ def increments(
 
 
 def in_gap(timestamps_s: Float64[np.ndarray, "N"], times_s: Float64[np.ndarray, "M"]) -> np.ndarray:
-    """Whether times lie outside a recording or in a gap of it, (M,); its samples' own times do not."""
+    """Whether times lie outside a recording or in one of its gaps, (M,); times of samples do not."""
     after = np.searchsorted(timestamps_s, times_s).clip(1, len(timestamps_s) - 1)
     before_s, after_s = timestamps_s[after - 1], timestamps_s[after]
     inside = (times_s >= before_s) & (times_s <= after_s)
@@ -102,7 +102,7 @@ def in_gap(timestamps_s: Float64[np.ndarray, "N"], times_s: Float64[np.ndarray, 
 def time_to_nearest(
     timestamps_s: Float64[np.ndarray, "N"], times_s: Float64[np.ndarray, "M"]
 ) -> Float64[np.ndarray, "M"]:
-    """How far times lie from the nearest of at least one increasing timestamps."""
+    """Distance in s from each time to the nearest timestamp; there must be one at least, and they must increase."""
     after = np.searchsorted(timestamps_s, times_s)
     neighbours = timestamps_s[np.stack([after - 1, after]).clip(0, len(timestamps_s) - 1)]
     return np.abs(neighbours - times_s).min(axis=0)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxmap.datasets.pose_files import read_poses
+from jaxmap.datasets.poses import read_poses
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion

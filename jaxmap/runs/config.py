@@ -8,29 +8,28 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Lt
 
+from jaxmap.datasets.options import ReadOptions
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.fusion.options import FusionOptions
-from jaxmap.geometry.options import DepthOptions, GridOptions, Triple
-from jaxmap.host.settings import NotNegative, Positive, Settings, options
+from jaxmap.geometry.options import DepthOptions, GridOptions
+from jaxmap.host.settings import NotNegative, Settings, options
 from jaxmap.labellers.options import DeeplabOptions, PlaneOptions
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 
 LabellerName = Literal["plane", "deeplab", "files", "none"]
 
 
 @options("")
-class MapConfig:
+class MapConfig(ReadOptions):
     """Everything that decides what a map comes out as."""
 
-    dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder or katwijk."""
     labeller: LabellerName = "plane"
     """What labels the points: the MLESAC plane, a network, files of labels, or nothing."""
     model: Path | None = None
     """Model file of the network, with the deeplab labeller (train and weights import write them); by default the
     bundled one, for rovers on sand."""
     model_sha256: str | None = None
-    """SHA-256 that the model file must have; the config.yaml of a run tells it."""
+    """SHA-256 that the model file must have; the config.yaml of a run records it."""
     labels: Path | None = None
     """Folder of labels, with the files labeller: NAME.png class indices or NAME.npy probabilities."""
     labels_are: Literal["auto", "raw", "rectified"] = "auto"
@@ -39,26 +38,6 @@ class MapConfig:
     """The classes of the map, in the order of the label indices: by default background sand rock; with deeplab
     the names that deeplab.class_map gives or, without any, all classes of the network. Points of its other
     classes are mapped without a class. Each class takes as much memory as the occupancy."""
-    poses: Path | None = None
-    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
-    poses_world: Literal["auto", "z_up", "camera"] = "auto"
-    """World of the poses: z up, camera-like (y down), or find out."""
-    calibration: Path | None = None
-    """Camera file in place of the sequence's own."""
-    camera: str | None = None
-    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
-    antenna_m: Triple | None = None
-    """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
-    crs: str | None = None
-    """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
-    max_pose_gap_s: Annotated[float, Positive] = 1.0
-    """Poses farther apart are not bridged."""
-    start: int = 0
-    """First frame."""
-    stop: int | None = None
-    """Frame to stop before, from the end if negative; by default the end."""
-    stride: Annotated[int, Positive] = 1
-    """Take every so many frames."""
     strict: bool = False
     """Stop at the first unusable frame instead of going on without it."""
     seed: Annotated[int, NotNegative, Lt(2**31)] = 0

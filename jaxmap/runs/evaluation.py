@@ -14,10 +14,9 @@ from jaxtyping import Float64
 
 import jaxmap
 from jaxmap.datasets.crs import Extent, crs_text, read_crs
-from jaxmap.datasets.label_coding import DEFAULT_CODING, LabelCoding
-from jaxmap.datasets.label_raster import LabelRaster
-from jaxmap.datasets.orthomosaic import read_label_orthomosaic, read_picture
-from jaxmap.datasets.pose_files import read_poses
+from jaxmap.datasets.label_raster import DEFAULT_CODING, LabelCoding, LabelRaster, read_label_orthomosaic
+from jaxmap.datasets.poses import read_poses
+from jaxmap.datasets.rasters import read_picture
 from jaxmap.datasets.rock_list import DEFAULT_DIAMETERS_M, draw_rocks, find_rock_lists, read_rock_lists
 from jaxmap.ensemble.layer import stored_layers
 from jaxmap.errors import JaxmapError, UsageError

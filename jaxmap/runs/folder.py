@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmap.datasets.pose_files import read_poses, write_tum
+from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.ensemble.layer import stored_layers
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.export.geotiff import write_geotiff

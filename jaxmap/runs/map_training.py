@@ -13,9 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxmap.datasets.crs import Extent, read_crs
-from jaxmap.datasets.label_coding import choose_coding
-from jaxmap.datasets.label_raster import LabelRaster
-from jaxmap.datasets.orthomosaic import read_label_orthomosaic
+from jaxmap.datasets.label_raster import LabelRaster, choose_coding, read_label_orthomosaic
 from jaxmap.errors import JaxmapError, UsageError, options_as, with_options
 from jaxmap.evaluation.cells import CellGrid
 from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map

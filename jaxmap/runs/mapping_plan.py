@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
+from jaxmap.datasets import StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.ensemble.draws import draw_ensemble
@@ -272,20 +272,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
     Raises:
         JaxmapError: the data or the settings do not serve.
     """
-    options = ReadOptions(
-        dataset=config.dataset,
-        poses=config.poses,
-        poses_world=config.poses_world,
-        calibration=config.calibration,
-        camera=config.camera,
-        antenna_m=config.antenna_m,
-        start=config.start,
-        stop=config.stop,
-        stride=config.stride,
-        max_pose_gap_s=config.max_pose_gap_s,
-        crs=config.crs,
-    )
-    sequence = open_sequence(source, options)
+    sequence = open_sequence(source, config)
     front_end = StereoFrontEnd(sequence.camera, config.stereo)
     camera = front_end.camera
     _describe_sequence(sequence, camera, notify)

@@ -17,9 +17,9 @@ from scipy.ndimage import map_coordinates
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.calibration import write_camera_yaml
 from jaxmap.datasets.crs import Extent, transform_between
-from jaxmap.datasets.height_raster import read_heights
 from jaxmap.datasets.label_raster import TARGET, UNLABELLED
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
+from jaxmap.datasets.rasters import read_heights
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.host.files import remove
@@ -33,7 +33,7 @@ from jaxmap.refinement.views import View, make_view, pinhole
 from jaxmap.report.refine_page import write_refine_report
 from jaxmap.runs.evaluation import TruthOptions, read_truth
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
 

@@ -23,8 +23,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import jaxmap
-from jaxmap.host.cache import cache_folder
 from jaxmap.errors import JaxmapError
+from jaxmap.host.cache import cache_folder
 from jaxmap.host.files import atomic_path
 
 NAMED = "DRJIT_LIBLLVM_PATH"

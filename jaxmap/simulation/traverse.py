@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.simulation.camera_rig import body_from_left, left_from_right, loccam, scaled, undistorted_pixels
 from jaxmap.simulation.develop import corner_distance, develop, exposure_gain
 from jaxmap.simulation.draw import Draw, draw_sky, draw_world

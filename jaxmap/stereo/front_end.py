@@ -1,4 +1,4 @@
-"""From a pair of images as read to a rectified left image and its disparity."""
+"""The stereo front end: from a pair of images as read to a rectified pair and its disparity."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import numpy as np
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
-from jaxmap.stereo.match import Matcher
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
 from jaxmap.types import StereoCamera
 
 
 class RectifiedFrame(NamedTuple):
-    """A rectified left image, its disparity (NaN where unknown), and what the two stages took."""
+    """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages."""
 
     left: np.ndarray
     right: np.ndarray
@@ -34,7 +33,12 @@ class StereoFrontEnd:
     """
 
     def __init__(self, camera: StereoCamera | StereoRig, options: StereoOptions) -> None:
-        """Prepares the look-up maps and the matcher."""
+        """Prepares the look-up maps and the matcher.
+
+        Raises:
+            JaxmapError: the cameras stand one above the other or are swapped.
+            UsageError: more disparities than columns.
+        """
         self.rectifier: Rectifier | None = None
         self.T_raw_rectified = np.eye(4)
         if isinstance(camera, StereoRig):
@@ -74,7 +78,7 @@ class StereoFrontEnd:
         return RectifiedFrame(left, right, disparity_px, stages_s["rectify"], stages_s["match"])
 
     def check_order(self, frame: RectifiedFrame, where: object = "") -> None:
-        """Refuses pairs whose left and right images are swapped.
+        """Rejects a pair whose left and right images are swapped.
 
         Raises:
             JaxmapError: the pair matches far better the other way round.
@@ -97,7 +101,7 @@ class StereoFrontEnd:
             return labels
         if labels.ndim == 2:
             return rectify_labels(labels, self.rectifier.left_maps, IGNORE)
-        # OpenCV takes at most four channels at once when it remaps with a border.
+        # With a border, OpenCV remaps at most four channels at once.
         planes = [
             rectify_image(np.ascontiguousarray(labels[..., c]), self.rectifier.left_maps)
             for c in range(labels.shape[2])

@@ -3,20 +3,67 @@
 from __future__ import annotations
 
 import threading
+from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
+from annotated_types import Ge, Interval
 
 from jaxmap.errors import FrameError, UsageError
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.host.settings import NotNegative, Positive, options
 
-_MODES = {
-    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
-    "hh": cv2.STEREO_SGBM_MODE_HH,
-    "hh4": cv2.STEREO_SGBM_MODE_HH4,
-}
 _SUBPIXELS = 16
+
+
+@options("stereo")
+class StereoOptions:
+    """Options of the rectification and of OpenCV's StereoSGBM; also the `stereo` node of the configuration.
+
+    Raises:
+        UsageError: a value out of its bounds, or one that OpenCV would refuse or silently change.
+    """
+
+    alpha: Annotated[float, Interval(ge=-1, le=1)] = 0.0
+    """Rectification: 0 keeps only pixels valid in both images, 1 keeps all, -1 lets OpenCV choose."""
+    mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
+    """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
+    min_disparity_px: int = 0
+    """Smallest disparity searched."""
+    num_disparities: Annotated[int, Positive] | None = None
+    """Disparities searched, a multiple of 16; by default an eighth of the image width."""
+    block_size: Annotated[int, Positive] = 5
+    """Edge of the matched block, odd."""
+    p1: Annotated[int, Positive] | None = None
+    """Penalty for a disparity step of one; by default 8 block_size^2."""
+    p2: Annotated[int, Positive] | None = None
+    """Penalty for a greater step; by default 32 block_size^2."""
+    pre_filter_cap: Annotated[int, Interval(ge=15, le=63)] = 31
+    """Truncation of the image gradient; OpenCV takes 15 at least."""
+    uniqueness_ratio: Annotated[int, Interval(ge=0, le=100)] = 10
+    """Margin in per cent by which the best match must win."""
+    left_right_max_diff_px: Annotated[int, Ge(-1)] = 1
+    """Greatest difference in the left-right check; -1 turns it off."""
+    speckle_window: Annotated[int, NotNegative] = 100
+    """Blobs of at most so many pixels are dropped; 0 turns it off."""
+    speckle_range_px: Annotated[int, NotNegative] = 2
+    """Disparity step that ends a blob."""
+    pad_left: bool = True
+    """Match the leftmost columns too."""
+
+    def __post_init__(self) -> None:
+        if (self.num_disparities or 0) % 16:
+            raise _bad(f"num_disparities is {self.num_disparities}", "take a positive multiple of 16")
+        if self.left_right_max_diff_px == 0:
+            raise _bad("left_right_max_diff_px is 0", "take 1 or more, or -1 to turn the check off")
+        if self.block_size % 2 == 0:
+            raise _bad(f"block_size is {self.block_size}", "take an odd number, usually 3 to 11")
+        p1, p2 = self.penalties()
+        if not p1 < p2:
+            raise _bad(f"p1 is {p1} and p2 is {p2}", "take 0 < p1 < p2")
+
+    def penalties(self) -> tuple[int, int]:
+        """The penalties p1 and p2 of disparity steps."""
+        area = self.block_size**2
+        return 8 * area if self.p1 is None else self.p1, 32 * area if self.p2 is None else self.p2
 
 
 class Matcher:
@@ -26,25 +73,12 @@ class Matcher:
         """Checks the options for images of this width.
 
         Raises:
-            UsageError: an option that OpenCV would refuse or silently change.
+            UsageError: as many disparities as columns, or more.
         """
         self.options = options
         self.num_disparities = options.num_disparities or -(-width_px // (8 * 16)) * 16
-        if self.num_disparities <= 0 or self.num_disparities % 16:
-            raise _bad(f"num_disparities is {self.num_disparities}", "take a positive multiple of 16")
-        if options.left_right_max_diff_px == 0:
-            raise _bad("left_right_max_diff_px is 0", "take 1 or more, or -1 to turn the check off")
-        if not 15 <= options.pre_filter_cap <= 63:
-            raise _bad(f"pre_filter_cap is {options.pre_filter_cap}", "take 15 to 63")
-        if options.block_size < 1 or options.block_size % 2 == 0:
-            raise _bad(f"block_size is {options.block_size}", "take an odd number, usually 3 to 11")
         if not options.pad_left and self.num_disparities + options.min_disparity_px >= width_px:
             raise _bad(f"{self.num_disparities} disparities in images {width_px} px wide", "take fewer")
-        area = options.block_size**2
-        self._p1 = 8 * area if options.p1 is None else options.p1
-        self._p2 = 32 * area if options.p2 is None else options.p2
-        if not 0 < self._p1 < self._p2:
-            raise _bad(f"p1 is {self._p1} and p2 is {self._p2}", "take 0 < p1 < p2")
         self._local = threading.local()
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -55,57 +89,62 @@ class Matcher:
             right: likewise, of the same size.
 
         Returns:
-            float32 (H, W), pixels, in sixteenths; NaN where there is no match, the check of left
-            against right failed, the match was not unique, or the blob was a speckle.
+            float32 (H, W) in px, a multiple of 1/16; NaN where the pixel has no match, failed the left-right
+            check, matched ambiguously or belongs to a speckle.
+
+        Raises:
+            FrameError: the two images differ in size.
         """
         if left.shape[:2] != right.shape[:2]:
-            raise FrameError(f"the left image is {_size(left)} and the right one {_size(right)}")
+            sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
+            raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
         left, right = _grey(left), _grey(right)
         pad = max(self.num_disparities + self.options.min_disparity_px, 0) if self.options.pad_left else 0
-        if pad:
-            left = cv2.copyMakeBorder(left, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
-            right = cv2.copyMakeBorder(right, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
+        left, right = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
         raw = self._engine().compute(left, right)[:, pad:]
         disparity_px = np.multiply(raw, np.float32(1 / _SUBPIXELS), dtype=np.float32)
         np.copyto(disparity_px, np.nan, where=raw < self.options.min_disparity_px * _SUBPIXELS)
         return disparity_px
 
     def looks_swapped(self, left: np.ndarray, right: np.ndarray, disparity_px: np.ndarray) -> bool:
-        """Whether the pair matches far better the other way round than it did."""
+        """Whether the pair matches far better with left and right exchanged."""
         valid = np.isfinite(disparity_px).mean()
-        # Pairs in order reach 0.8 and more where all is textured; swapped ones 0.2 to 0.6.
+        # Textured pairs in the right order reach 0.8 and more, swapped ones 0.2 to 0.6.
         if valid > 0.75:
             return False
         other_way = np.isfinite(self(right, left)).mean()
         return bool(other_way > 0.2 and other_way > 1.4 * valid)
 
-    def _engine(self) -> cv2.StereoSGBM:
-        # An engine keeps its buffers from call to call, so each thread has its own.
+    def _engine(self) -> Any:
+        # Imported here, so that the command line can read the options without OpenCV.
+        import cv2
+
+        # An engine reuses its buffers, so each thread has its own.
         if not hasattr(self._local, "engine"):
             options, unchecked = self.options, self.options.left_right_max_diff_px < 0
+            p1, p2 = options.penalties()
+            mode = "SGBM_3WAY" if options.mode == "3way" else options.mode.upper()
             self._local.engine = cv2.StereoSGBM.create(
                 minDisparity=options.min_disparity_px,
                 numDisparities=self.num_disparities,
                 blockSize=options.block_size,
-                P1=self._p1,
-                P2=self._p2,
-                # OpenCV takes anything below 1 for 1, so the check is turned off by a difference that never occurs.
+                P1=p1,
+                P2=p2,
+                # OpenCV raises anything below 1 to 1, so a difference that never occurs turns the check off.
                 disp12MaxDiff=self.num_disparities + 1 if unchecked else options.left_right_max_diff_px,
                 preFilterCap=options.pre_filter_cap,
                 uniquenessRatio=options.uniqueness_ratio,
                 speckleWindowSize=options.speckle_window,
                 speckleRange=options.speckle_range_px,
-                mode=_MODES[options.mode],
+                mode=getattr(cv2, f"STEREO_SGBM_MODE_{mode}"),
             )
         return self._local.engine
 
 
 def _grey(image: np.ndarray) -> np.ndarray:
+    import cv2
+
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
-def _size(image: np.ndarray) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"
 
 
 def _bad(what: str, fix: str) -> UsageError:

@@ -18,8 +18,8 @@ class StereoRig:
     """Calibration of a raw (distorted, unrectified) stereo pair, OpenCV's conventions.
 
     `x_right = R_right_left @ x_left + t_right_left_m`; pixel centres are integers (MATLAB's
-    principal points less 1); distortion is `k1 k2 p1 p2 [k3 [k4 k5 k6]]`. `doffs_px` is added to the
-    disparity offset that rectification leaves, for a pair that was found to be off by a constant.
+    principal points minus 1); distortion is `k1 k2 p1 p2 [k3 [k4 k5 k6]]`. `doffs_px` is added to the
+    disparity offset of the rectified pair, to correct a constant error.
     """
 
     K_left: np.ndarray
@@ -48,7 +48,7 @@ def make_stereo_rig(
     """Checks and builds a `StereoRig`; `size_px` is (width, height).
 
     Raises:
-        JaxmapError: a wrong shape, a number that is not finite, a rotation that is none, no baseline.
+        JaxmapError: a wrong shape, a number that is not finite, an invalid rotation, no baseline.
     """
     arrays = {
         name: np.asarray(value, np.float64)
@@ -94,8 +94,8 @@ def make_stereo_rig(
 class Rectifier(NamedTuple):
     """A rectified camera and the look-up maps that make its images.
 
-    `R_rectified_left` turns vectors of the raw left camera into the rectified one, so a pose of the
-    raw camera becomes `T_world_camera @ inverse(R_rectified_left)`. `seen` marks the rectified
+    `R_rectified_left` rotates vectors from the raw left camera frame into the rectified one, so a pose of
+    the raw camera becomes `T_world_camera @ inverse(R_rectified_left)`. `seen` marks the rectified
     pixels that lie inside the raw left image.
     """
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int8
 
 from jaxmap.datasets.crs import Extent, transform_between
-from jaxmap.datasets.height_raster import read_heights
+from jaxmap.datasets.rasters import read_heights
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.types import GridSpec
 

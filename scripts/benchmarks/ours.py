@@ -41,7 +41,7 @@ from jaxmap.mapping.step import Mapper, MapperParams, compile_step, make_mapper
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.importers import import_weights
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 from jaxmap.types import Frame, GridSpec, PointLabels, VoxelMap, make_voxel_map
 
 BACKBONE = "mobilenet_v2"

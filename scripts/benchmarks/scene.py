@@ -15,11 +15,9 @@ import numpy as np
 from PIL import Image
 
 from jaxmap.datasets import open_sequence
-from jaxmap.datasets.pose_files import write_tum
-from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD
+from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD, write_tum
 from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M
-from jaxmap.stereo.match import Matcher
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.types import GridSpec, StereoCamera, make_grid, make_stereo_camera
 
 SIZES = ("small", "medium", "large")

@@ -14,8 +14,7 @@ from benchmarks.harness import Amount, Case, Peer, Run
 from benchmarks.scene import DISPARITIES, Scene, make_scene
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.host.files import config_folder
-from jaxmap.stereo.match import Matcher
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.stereo.rectify import StereoRig, make_rectifier, make_stereo_rig, rectify_image
 
 

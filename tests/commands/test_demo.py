@@ -13,7 +13,7 @@ import rasterio
 from fixtures import shared_cache  # noqa: F401
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.pose_files import read_poses
+from jaxmap.datasets.poses import read_poses
 from jaxmap.datasets.samples import sample_truth
 from jaxmap.host.files import bundled
 from jaxmap.labels import ROVER_CLASSES

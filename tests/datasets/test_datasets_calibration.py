@@ -6,7 +6,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.datasets.calibration import load_yaml, read_camera_yaml, read_text
+from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.text_files import load_yaml, read_text
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 from jaxmap.types import StereoCamera
@@ -83,7 +84,7 @@ def test_all_missing_and_unknown_keys_are_named(tmp_path):
         ({"image_size_px": [float("nan"), 48]}, "give [width, height] in whole pixels"),
     ],
 )
-def test_wrong_values_are_told_by_key(tmp_path, change, message):
+def test_wrong_values_are_reported_by_key(tmp_path, change, message):
     assert message in refused(tmp_path / "camera.yaml", RECTIFIED | change)
 
 
@@ -100,7 +101,7 @@ def test_wrong_values_are_told_by_key(tmp_path, change, message):
         ({"t_right_left_m": [0, 0, 0]}, "the stereo baseline is zero in FILE"),
     ],
 )
-def test_wrong_values_of_a_rig_are_told_by_key(tmp_path, change, message):
+def test_wrong_values_of_a_rig_are_reported_by_key(tmp_path, change, message):
     assert message in refused(tmp_path / "camera.yaml", RAW | change)
 
 
@@ -130,7 +131,7 @@ def test_yaml_without_keys_is_refused(tmp_path, text):
         "a: !!bool maybe",
         "a: !!int ''",
         "a: !!timestamp no",
-        "[" * 5000,
+        "[" * 1200,
         "a: \x07",
         "{[]: 1}",
     ],

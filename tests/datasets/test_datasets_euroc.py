@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.pose_files import write_tum
-from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD
+from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD, write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 
@@ -95,7 +94,7 @@ def test_images_without_a_partner_are_dropped_and_noted(tmp_path):
     assert refused(folder).startswith("no left and right images lie within 5 ms of each other in REC/mav0; check")
 
 
-def test_missing_ground_truth_is_told(tmp_path):
+def test_missing_ground_truth_is_reported(tmp_path):
     assert refused(made_recording(tmp_path, ground_truth=False)) == (
         "the sequence has no poses: there is no file REC/mav0/state_groundtruth_estimate0/data.csv; give them with "
         "--poses FILE (TUM text, T_world_camera of the left camera)"
@@ -120,7 +119,7 @@ def test_missing_ground_truth_is_told(tmp_path):
         ("[-0.1, 0.01, 0.0, 0.0]", "[-0.1, 0.01", "malformed YAML"),
     ],
 )
-def test_faulty_sensor_files_are_told(tmp_path, old, new, message):
+def test_faulty_sensor_files_are_reported(tmp_path, old, new, message):
     folder = made_recording(tmp_path)
     path = folder / "mav0" / "cam0" / "sensor.yaml"
     path.write_text(path.read_text().replace(old, new))
@@ -138,13 +137,13 @@ def test_faulty_sensor_files_are_told(tmp_path, old, new, message):
         ("-5,a.png\n", "'-5' is not a time in whole nanoseconds"),
     ],
 )
-def test_faulty_image_lists_are_told_by_line(tmp_path, rows, message):
+def test_faulty_image_lists_are_reported_by_line(tmp_path, rows, message):
     folder = made_recording(tmp_path)
     (folder / "mav0" / "cam1" / "data.csv").write_text(rows)
     assert message in refused(folder)
 
 
-def test_images_of_another_size_are_told(tmp_path):
+def test_images_of_another_size_are_reported(tmp_path):
     folder = made_recording(tmp_path)
     for camera in ("cam0", "cam1"):
         path = folder / "mav0" / camera / "sensor.yaml"

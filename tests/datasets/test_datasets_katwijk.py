@@ -12,11 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.calibration import read_camera_yaml
-from jaxmap.datasets.katwijk import find_parts
-from jaxmap.datasets.katwijk_files import parse_time, read_gps, read_imu, read_wheels
-from jaxmap.datasets.katwijk_rover import CAMERAS, R_BODY_IMU, body_to_camera
-from jaxmap.datasets.pose_files import read_poses, write_tum
-from jaxmap.datasets.poses import poses_at
+from jaxmap.datasets.katwijk import (
+    CAMERAS,
+    R_BODY_IMU,
+    body_to_camera,
+    find_parts,
+    parse_time,
+    read_gps,
+    read_imu,
+    read_wheels,
+)
+from jaxmap.datasets.poses import poses_at, read_poses, write_tum
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.pose_scores import pose_errors
 from jaxmap.host.files import config_folder
@@ -71,7 +77,7 @@ def test_a_part_opens_with_poses_of_its_own(made):
     assert sequence.notes[0].startswith(
         "position from 17 GPS fixes (17 RTK_FIXED), heading from motion and gyro (to 0."
     )
-    assert sequence.notes[1].startswith("between fixes the wheels count, with a radius of 0.11")
+    assert sequence.notes[1].startswith("between fixes the poses follow the wheels, with a radius of 0.11")
 
 
 def test_given_poses_in_utm_are_taken_as_they_are(made, tmp_path):
@@ -84,7 +90,7 @@ def test_given_poses_in_utm_are_taken_as_they_are(made, tmp_path):
     T[:, :3, 3] -= SITE_UTM_M
     write_tum(tmp_path / "poses.tum", START_S + frames_s, T)
     sequence = open_sequence(folder, ReadOptions(poses=tmp_path / "poses.tum"))
-    assert (sequence.crs, sequence.notes) == (None, ("the poses given are not UTM: --crs says what they are",))
+    assert (sequence.crs, sequence.notes) == (None, ("the poses given are not UTM: name their system with --crs",))
 
 
 @pytest.mark.parametrize(
@@ -128,22 +134,22 @@ def test_images_without_partner_repeated_or_otherwise_named_are_counted(part):
     sequence = open_sequence(part)
     assert len(sequence.frames) == 4
     assert sequence.notes[:3] == (
-        "LocCam: 2 images have no partner of their time and are left out",
-        "LocCam: 1 images are of a time that was there before and are left out",
-        "LocCam: 1 images are not named by a time and a side and are left out",
+        "LocCam: 2 images without partner left out",
+        "LocCam: 1 images with a repeated time left out",
+        "LocCam: 1 images with other names left out",
     )
 
 
-def test_no_pairs_at_all_are_told(part):
+def test_no_pairs_at_all_are_reported(part):
     for path in (part / "LocCam").glob("*_1.png"):
         path.unlink()
     assert refused(part) == (
-        "no pair among 6 left and 0 right images and 0 of other names in PART/LocCam; name them "
+        "no pair among 6 left and 0 right images and 0 with other names in PART/LocCam; name them "
         "LocCam_YYYY_MM_DD_HH_MM_SS_ms_0.png (left) and _1.png (right)"
     )
 
 
-def test_a_folder_of_parts_is_told_with_its_parts(made, tmp_path):
+def test_a_folder_of_parts_is_reported_with_its_parts(made, tmp_path):
     root = made[0].parent.parent
     assert refused(root) == "the folder holds parts (Traverse1/Part2) in PART; give one of them"
     for name in ("Part10", "Part9", "Traverse2/Part1"):
@@ -189,11 +195,11 @@ def test_damaged_lines_are_left_out_sorted_and_counted(part, made):
     sequence = open_sequence(part)
     total = len((part / "imu.txt").read_bytes().splitlines())
     assert set(sequence.notes[2:]) == {
-        "gps-latlong.txt: 1 of 19 lines that cannot be read are left out",
-        f"imu.txt: 4 of {total} lines that cannot be read are left out",
-        f"imu.txt: 1 of {total} lines out of order are sorted",
-        f"imu.txt: 1 of {total} lines of a time that was there before are left out",
-        "odometry.txt: 1 of 308 lines that cannot be read are left out",
+        "gps-latlong.txt: 1 of 19 lines that cannot be read left out",
+        f"imu.txt: 4 of {total} lines that cannot be read left out",
+        f"imu.txt: 1 of {total} lines out of order sorted",
+        f"imu.txt: 1 of {total} lines with a repeated time left out",
+        "odometry.txt: 1 of 308 lines that cannot be read left out",
     }
     assert len(sequence.frames) == 6
     whole = open_sequence(made[0])
@@ -209,15 +215,15 @@ def test_frames_far_from_fixes_are_counted_and_those_in_gaps_of_the_imu_left_out
     assert sequence.notes[-1].startswith("1 of 6 frames have no pose and are left out")
 
 
-def test_without_odometry_it_goes_on_and_says_so(part):
+def test_without_odometry_a_constant_speed_is_assumed_and_reported(part):
     (part / "odometry.txt").unlink()
     assert (
-        "there is no odometry.txt: between the fixes the rover is taken to go on as it went"
+        "there is no odometry.txt: between the fixes the rover is assumed to keep its speed"
         in open_sequence(part).notes
     )
 
 
-def test_another_clock_is_told(part):
+def test_another_clock_is_reported(part):
     for path in (part / "LocCam").iterdir():
         path.rename(path.with_name(path.name.replace("2015", "2016")))
     assert refused(part).startswith(
@@ -225,7 +231,7 @@ def test_another_clock_is_told(part):
     )
 
 
-def test_utm_is_told_by_its_magnitude(part, tmp_path):
+def test_utm_is_reported_by_its_magnitude(part, tmp_path):
     gps, _ = read_gps(part)
     easting, northing, altitude = gps.fixes.antenna_world_m.T
     rows = list(zip(gps.fixes.timestamps_s - START_S, easting, northing, altitude, strict=True))
@@ -244,9 +250,6 @@ def test_the_antenna_can_be_set(made):
         for height_m in (1.5785, 1.503)
     ]
     assert heights[1] - heights[0] == pytest.approx(0.0755, abs=1e-3)
-    assert refused(made[0], ReadOptions(antenna_m=(0, 0, float("nan"))), UsageError).startswith(
-        "antenna_m is (0, 0, nan)"
-    )
 
 
 def test_cameras_are_chosen_by_name(part):
@@ -260,11 +263,12 @@ def as_pancam(part: Path) -> None:
     from PIL import Image
 
     (part / "PanCam").mkdir()
+    Image.new("L", (1280, 960)).save(part / "black.png")
     for path in (part / "LocCam").iterdir():
-        Image.new("L", (1280, 960)).save(part / "PanCam" / path.name.replace("LocCam", "PanCam"))
+        shutil.copy(part / "black.png", part / "PanCam" / path.name.replace("LocCam", "PanCam"))
 
 
-def test_pancam_looks_where_pan_and_tilt_say(part, made):
+def test_pancam_turns_with_pan_and_tilt(part, made):
     as_pancam(part)
     _, truth, frames_s = made
     assert refused(part, ReadOptions(camera="pancam")).startswith("no ptu.txt (No such file or directory) in PART")
@@ -299,7 +303,7 @@ def test_loccam_looks_ahead_and_down():
     np.testing.assert_allclose(T[:3, 0], [0, -1, 0], atol=1e-3)
 
 
-def test_images_of_another_size_than_the_calibration_are_told(part):
+def test_images_of_another_size_than_the_calibration_are_reported(part):
     calibration = config_folder() / "cameras" / "katwijk_pancam.yaml"
     assert refused(part, ReadOptions(calibration=calibration)) == (
         "images are 1024x768 px, the calibration is for 1280x960 px in PART; give the calibration of these images"
@@ -324,8 +328,8 @@ def test_the_recorded_excerpts_are_read_whole(realdata):
     np.testing.assert_allclose(np.diff(gps.fixes.timestamps_s), 3, atol=0.01)
     np.testing.assert_allclose(np.diff(imu.timestamps_s), 0.008, atol=0.0011)
     np.testing.assert_allclose(gps.fixes.antenna_world_m[0], [595_678, 5_785_782, 6.2], atol=5)
-    assert np.linalg.norm(imu.force_body, axis=1) == pytest.approx(9.81, abs=0.1)
-    assert not wheels.turning.any()
+    assert np.linalg.norm(imu.specific_force_body_m_s2, axis=1) == pytest.approx(9.81, abs=0.1)
+    assert not wheels.rolling.any()
 
 
 @pytest.mark.realdata

@@ -9,7 +9,7 @@ import yaml
 from PIL import Image
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 
 REALDATA = Path(os.environ.get("JAXMAP_REALDATA", Path(__file__).parents[2] / ".." / "shared" / "realdata"))
@@ -84,7 +84,7 @@ def test_part_of_the_images_keep_their_own_poses(tmp_path):
     assert "1 of 4 frames have no left image" in sequence.notes
 
 
-def test_missing_files_are_told(tmp_path):
+def test_missing_files_are_reported(tmp_path):
     folder = made_sequence(tmp_path)
     (tmp_path / "poses" / "07.txt").unlink()
     message = refused(folder)
@@ -93,7 +93,7 @@ def test_missing_files_are_told(tmp_path):
     assert refused(folder) == "there is no file SEQ/times.txt; check the path"
 
 
-def test_counts_that_disagree_are_told(tmp_path):
+def test_counts_that_disagree_are_reported(tmp_path):
     folder = made_sequence(tmp_path)
     write_own_poses(tmp_path, 3)
     assert refused(folder).startswith("3 poses for 4 frames in ROOT/poses/07.txt; poses without times need")
@@ -108,14 +108,17 @@ def test_counts_that_disagree_are_told(tmp_path):
         (CALIB.splitlines()[0], "no line P1 in SEQ/calib.txt; restore the file"),
         (CALIB.replace("-4", "x"), "P1 is not twelve numbers in SEQ/calib.txt line 2; restore the file"),
         (CALIB.replace("-4 0 8 2", "-4 0 8"), "P1 is not twelve numbers in SEQ/calib.txt line 2"),
-        (CALIB.replace("P0: 8", "P0: -8"), "P0 is no projection in SEQ/calib.txt line 1; restore the file"),
-        (CALIB.replace("P0: 8", "P0: nan"), "P0 is no projection in SEQ/calib.txt line 1; restore the file"),
-        (CALIB.replace("P0: 8 0", "P0: 8 1"), "P0 is no rectified camera in SEQ/calib.txt line 1; restore the file"),
+        (CALIB.replace("P0: 8", "P0: -8"), "P0 is not a projection matrix in SEQ/calib.txt line 1; restore the file"),
+        (CALIB.replace("P0: 8", "P0: nan"), "P0 is not a projection matrix in SEQ/calib.txt line 1; restore the file"),
+        (
+            CALIB.replace("P0: 8 0", "P0: 8 1"),
+            "P0 is not of a rectified camera in SEQ/calib.txt line 1; restore the file",
+        ),
         (CALIB.replace("P1: 8", "P1: 9"), "the two cameras differ in SEQ/calib.txt; give a rectified pair"),
         (CALIB.replace("-4", "4"), "baseline_m is -0.5, it must be positive in SEQ/calib.txt; check the calibration"),
     ],
 )
-def test_faulty_calibration_is_told_by_line(tmp_path, calib, message):
+def test_faulty_calibration_is_reported_by_line(tmp_path, calib, message):
     folder = made_sequence(tmp_path)
     (folder / "calib.txt").write_text(calib)
     assert message in refused(folder)

@@ -13,8 +13,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.calibration import read_camera_yaml
-from jaxmap.datasets.matlab_calibration import read_matlab_calibration
-from jaxmap.datasets.matlab_objects import structs_of_objects
+from jaxmap.datasets.matlab import read_matlab_calibration, structs_of_objects
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import config_folder
 from jaxmap.stereo.rectify import make_rectifier
@@ -121,13 +120,13 @@ def test_units_and_sizes_are_those_of_the_file(tmp_path):
         ({"s": stereo(TranslationOfCamera2=np.full(3, np.nan))}, "t_right_left_m holds a number that is not finite"),
     ],
 )
-def test_what_is_no_calibration_is_told(tmp_path, content, message):
+def test_what_is_no_calibration_is_reported(tmp_path, content, message):
     path = tmp_path / "stereo.mat"
     savemat(path, content)
     assert refused(path).startswith(message)
 
 
-def test_what_is_no_mat_file_is_told(tmp_path):
+def test_what_is_no_mat_file_is_reported(tmp_path):
     path = tmp_path / "stereo.mat"
     assert refused(path).startswith("there is no file FILE; check the path")
     path.write_text("image_size_px: [1, 2]")
@@ -137,7 +136,7 @@ def test_what_is_no_mat_file_is_told(tmp_path):
 
 
 @given(st.data())
-def test_damaged_objects_are_told_and_never_crash(data):
+def test_damaged_objects_are_reported_and_never_crash(data):
     stream = bytearray(object_stream(objects_of(stereo())))
     cut = data.draw(st.integers(0, len(stream)))
     for _ in range(data.draw(st.integers(0, 6))):

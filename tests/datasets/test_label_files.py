@@ -15,7 +15,7 @@ from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 
 REF = FrameRef("f000", 0.0, Path("left/f000.png"), Path("right/f000.png"))
 PLAIN = StereoFrontEnd(CAMERA, StereoOptions())
@@ -128,7 +128,7 @@ def test_missing_and_broken_files_are_faults_of_their_frame(tmp_path, soft, cont
     assert "; " in str(caught.value)
 
 
-def test_the_first_frame_tells_which_kind_they_are(tmp_path):
+def test_the_first_frame_distinguishes_which_kind_they_are(tmp_path):
     Image.fromarray(truth()).save(tmp_path / "f000.png")
     np.save(tmp_path / "f001.npy", one_hot())
     assert not open_label_folder(tmp_path, 3, "raw", "f000").soft

@@ -22,7 +22,7 @@ from tune_faults import labels_from_above, write_truth
 import jaxmap.runs.refinement
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.calibration import read_camera_yaml, read_mounting, write_camera_yaml
-from jaxmap.datasets.pose_files import read_poses, write_tum
+from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.host.output_folder import locked
 from jaxmap.stereo.rectify import make_rectifier, make_stereo_rig
 

@@ -21,7 +21,7 @@ from jaxmap.host.files import config_folder
 from jaxmap.labellers.options import DeeplabOptions, PlaneOptions
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 
 CONFIGS = sorted(config_folder().glob("*.yaml"))
 
@@ -66,7 +66,9 @@ configs = st.builds(
         lower_m=st.none() | st.tuples(*[st.floats(-1e6, 1e6)] * 3),
         max_memory_gib=st.floats(0.1, 64),
     ),
-    stereo=st.builds(StereoOptions, alpha=st.floats(-1, 1), num_disparities=st.none() | st.integers(1, 512)),
+    stereo=st.builds(
+        StereoOptions, alpha=st.floats(-1, 1), num_disparities=st.none() | st.integers(1, 32).map(lambda n: 16 * n)
+    ),
     fusion=st.builds(
         FusionOptions,
         per_frame=st.sampled_from(["sum", "once", "mean"]),

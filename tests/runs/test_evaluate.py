@@ -120,7 +120,7 @@ def test_a_map_without_a_system_is_told_where_it_gets_one(cli, tmp_path):
     rock = np.zeros((4, 4), bool)
     run = write_map(tmp_path / "run", rock, ~rock, crs=None)
     outcome = cli("evaluate", run, truth_file(tmp_path))
-    assert (outcome.status, "the map has no CRS, say it with jaxmap map --crs" in outcome.error) == (1, True)
+    assert (outcome.status, "the map has no CRS, name it with jaxmap map --crs" in outcome.error) == (1, True)
 
 
 def test_the_error_map_shows_each_verdict_in_its_place(run, tmp_path):
@@ -150,7 +150,7 @@ def damaged_map(run: Path) -> None:
         (("--class", "bush"), 2, "the map has no class 'bush': its classes are background sand rock"),
         (("--cell-size-m", "0"), 2, "cell_size_m is 0.0"),
         (("--max-range-m", "5"), 1, "--max-range-m needs poses.tum and metrics.json"),
-        (("--remap", "5=rock"), 1, "label values that mean nothing"),
+        (("--remap", "5=rock"), 1, "label values without a class"),
         (("--remap", "rock"), 2, "is not CODE=CLASS"),
         (("--remap", "1=sand", "--palette", "p.yaml"), 2, "exclude each other"),
         (("--truth-crs", "EPSG:1"), 1, "unknown coordinate reference system"),

@@ -16,7 +16,7 @@ from planned_runs import config_of, log_odds, metrics_of, planned, ran, voxels_o
 from scenes import BASELINE_M, BOXES_M, ROCK, SAND, frame_name, pose, scene_frame, timestamp_s, write_folder_sequence
 
 import jaxmap.runs.mapping_plan
-from jaxmap.datasets.pose_files import read_poses
+from jaxmap.datasets.poses import read_poses
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.geometry.bounds import grid_around_views, map_bytes

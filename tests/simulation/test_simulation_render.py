@@ -12,7 +12,7 @@ from fixtures import Run, cli  # noqa: F401
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.calibration import read_camera_yaml
-from jaxmap.datasets.pose_files import read_poses
+from jaxmap.datasets.poses import read_poses
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.simulation.camera_rig import loccam, scaled, undistorted_pixels

@@ -24,7 +24,7 @@ from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 
 
 @cache

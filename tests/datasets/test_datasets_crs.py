@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.datasets.geodesy import to_utm, utm_crs
+from jaxmap.datasets.crs import to_utm, utm_crs
 from jaxmap.errors import JaxmapError
 
 
@@ -51,6 +51,6 @@ def test_zones_are_six_degrees_wide(longitude, latitude, crs):
     assert utm_crs(longitude, latitude) == crs
 
 
-def test_places_off_the_earth_are_told():
-    with pytest.raises(JaxmapError, match="has no place on the map in EPSG:32631"):
+def test_places_off_the_earth_are_reported():
+    with pytest.raises(JaxmapError, match="is outside the domain of the projection in EPSG:32631"):
         to_utm("EPSG:32631", np.array([4.4]), np.array([1e5]))

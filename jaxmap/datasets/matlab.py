@@ -1,14 +1,19 @@
-"""Stereo calibrations as MATLAB saves them: `stereoParameters`, as an object or as a plain struct."""
+"""Stereo calibrations as MATLAB saves them: `stereoParameters`, as an object or as a plain struct.
+
+`scipy.io` does not open MATLAB objects. A MAT file keeps their contents in a hidden variable, a stream of elements in
+the format of MAT files themselves (version 5: "MAT-File Format", The MathWorks). A class that saves itself as a
+struct, such as `stereoParameters`, leaves that struct in the stream with all its names.
+"""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxmap.datasets.matlab_objects import structs_of_objects
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
 
@@ -17,6 +22,14 @@ _METRES |= {"inches": 0.0254, "": 0.001}
 
 _STEREO_KEYS = ("RotationOfCamera2", "TranslationOfCamera2")
 _CAMERA_KEYS = ("CameraParameters1", "CameraParameters2")
+
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+"""Storage types of elements."""
+
+_MATRIX, _CELL, _STRUCT, _CHAR, _OPAQUE = 14, 1, 2, 4, 17
+_NUMERIC = range(6, 16)
+_HEADER = 8
+_MAX_DEPTH = 16
 
 
 def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
@@ -27,12 +40,12 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
 
     Args:
         path: the file.
-        size_px: (width, height), where the file does not say it; old ones do not.
+        size_px: (width, height), for old files, which lack it.
 
     Raises:
-        JaxmapError: no MAT file, without a stereo calibration, or with skewed pixels, which are not modelled.
+        JaxmapError: not a MAT file, without a stereo calibration, or with skewed pixels, which are not modelled.
     """
-    # Loads much that no other reader needs.
+    # Imported here: no other reader needs it.
     from scipy.io import loadmat
 
     if not path.is_file():
@@ -42,7 +55,7 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
     except NotImplementedError as fault:
         raise JaxmapError("a MAT file of version 7.3", where=path, fix="save it in MATLAB with -v7") from fault
     except Exception as fault:
-        # Damaged files raise nearly anything in the parser.
+        # On damaged files the parser raises nearly anything.
         raise JaxmapError(f"not a MAT file ({type(fault).__name__})", where=path, fix="restore the file") from fault
     for stereo in _structs(content):
         if all(isinstance(stereo.get(key), Mapping) for key in _CAMERA_KEYS) and set(_STEREO_KEYS) <= set(stereo):
@@ -119,3 +132,80 @@ def _image_size(camera: Mapping[str, Any], size_px: tuple[int, int]) -> tuple[in
     """MATLAB's ImageSize is [rows, columns], and empty in old calibrations."""
     size = np.ravel(camera.get("ImageSize", []))
     return (int(size[1]), int(size[0])) if size.size == 2 and size.dtype.kind in "iuf" and size.all() else size_px
+
+
+def structs_of_objects(stream: bytes, where: object) -> list[dict[str, Any]]:
+    """All structs of a `__function_workspace__`, in their order: name -> array, text or None.
+
+    Arrays have their MATLAB shape; values that are neither numbers nor text are None.
+
+    Raises:
+        JaxmapError: the stream is damaged.
+    """
+    if len(stream) < _HEADER or stream[2:4] not in (b"IM", b"MI"):
+        raise JaxmapError("the objects in the file cannot be read", where=where, fix="save them as plain structs")
+    order = "<" if stream[2:4] == b"IM" else ">"
+    found: list[dict[str, Any]] = []
+    try:
+        for kind, data in _elements(stream[_HEADER:], order):
+            if kind == _MATRIX:
+                _value(data, order, found, 0)
+    except (struct.error, ValueError, IndexError, UnicodeDecodeError) as fault:
+        raise JaxmapError(
+            f"the objects in the file are damaged ({fault})", where=where, fix="restore the file"
+        ) from fault
+    return found
+
+
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Type and content of each element."""
+    position = 0
+    while position + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, position)
+        if kind >> 16:
+            # Small elements hold size and type in one word, and up to four bytes in the next.
+            yield kind & 0xFFFF, data[position + 4 : position + 4 + (kind >> 16)]
+            position += 8
+            continue
+        if position + 8 + size > len(data):
+            raise ValueError("an element is cut off")
+        yield kind, data[position + 8 : position + 8 + size]
+        position += 8 + (size + 7) // 8 * 8
+
+
+def _value(data: bytes, order: str, found: list[dict[str, Any]], depth: int) -> Any:
+    """The value of a matrix element; structs in it are added to `found`."""
+    if depth > _MAX_DEPTH:
+        raise ValueError("nested too deep")
+    parts = [*_elements(data, order)]
+    if not parts:
+        return None
+    flags = int.from_bytes(parts[0][1][:4], "little" if order == "<" else "big")
+    array_class = flags & 0xFF
+    if array_class == _OPAQUE:
+        # Names of type and class, then what the object was made from.
+        for kind, inner in parts[1:]:
+            if kind == _MATRIX:
+                _value(inner, order, found, depth + 1)
+        return None
+    shape = np.frombuffer(parts[1][1], f"{order}i4")
+    if array_class == _CELL:
+        for _, inner in parts[3:]:
+            _value(inner, order, found, depth + 1)
+    elif array_class == _STRUCT:
+        # The names are one text, each padded to the length in the element before it.
+        width = int(np.frombuffer(parts[3][1], f"{order}i4")[0])
+        text = parts[4][1]
+        names = [text[at : at + width].split(b"\0")[0].decode("ascii") for at in range(0, len(text), max(width, 1))]
+        whole: dict[str, Any] = {}
+        found.append(whole)
+        whole |= {
+            name: _value(inner, order, found, depth + 1) for name, (_, inner) in zip(names, parts[5:], strict=False)
+        }
+    elif array_class == _CHAR:
+        kind, raw = parts[3]
+        return raw.decode(f"utf-16-{'le' if order == '<' else 'be'}" if kind in (4, 17) else "utf-8", "replace")
+    elif array_class in _NUMERIC and len(parts) > 3:
+        kind, raw = parts[3]
+        return np.frombuffer(raw, order + _NUMBERS.get(kind, "u1")).reshape(shape, order="F")
+    return None

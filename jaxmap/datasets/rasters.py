@@ -1,4 +1,4 @@
-"""The part of a georeferenced raster that lies over a map, from any file format that GDAL knows."""
+"""The part of a georeferenced raster that lies over a map, from any file format that GDAL reads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Shaped
+from jaxtyping import Bool, Float64, Shaped, UInt8
 
 from jaxmap.datasets.crs import Extent, crs_text, extent_in
 from jaxmap.errors import JaxmapError
@@ -25,16 +25,16 @@ Colours = dict[int, tuple[int, int, int]]
 
 
 class RasterWindow(NamedTuple):
-    """Pixels of a raster, and where they lie.
+    """Georeferenced pixels of a raster.
 
     Attributes:
-        bands: the file's own numbers; a band of transparency is left out.
+        bands: the values as stored, without an alpha band.
         valid: pixels that are neither nodata nor transparent.
         T_crs_pixel: affine, takes (column, row, 1) of this window to coordinates of `crs`; pixel `i` spans
             `[i, i + 1)`.
-        crs: the system; None where neither the file nor the place says one.
+        crs: the coordinate reference system; None where both the file's and the map's are unknown.
         palette: RGB of the values of a palette image, or None.
-        notes: what was assumed, in words.
+        notes: assumptions made in reading it.
     """
 
     bands: Shaped[np.ndarray, "B H W"]
@@ -45,25 +45,41 @@ class RasterWindow(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_window(path: Path, place: Extent, crs: str | None = None, margin: float = 0.0) -> RasterWindow:
-    """Reads the pixels of a raster that lie over a place.
+class HeightRaster(NamedTuple):
+    """Georeferenced heights.
 
-    Where the raster or the place is of an unknown system, it is taken for that of the other if the two overlap.
+    Attributes:
+        height_m: (rows, columns), NaN where there is none.
+        T_crs_pixel: affine, takes (column, row, 1) to coordinates of `crs`; pixel `i` spans `[i, i + 1)`.
+        crs: the coordinate reference system, None where it is unknown.
+        notes: assumptions made in reading it.
+    """
+
+    height_m: Float64[np.ndarray, "H W"]
+    T_crs_pixel: Float64[np.ndarray, "3 3"]
+    crs: str | None
+    notes: tuple[str, ...]
+
+
+def read_window(path: Path, place: Extent, crs: str | None = None, margin: float = 0.0) -> RasterWindow:
+    """Reads the pixels of a raster that lie over an extent.
+
+    Where the coordinate reference system of one of the two is unknown, that of the other is assumed if they overlap.
 
     Args:
         path: the file.
-        place: what is asked for.
-        crs: the raster's system, in place of what the file says.
-        margin: how much more is read on each side, in units of the place.
+        place: the extent.
+        crs: the raster's coordinate reference system, in place of the file's own.
+        margin: added on each side, in units of the extent.
 
     Raises:
-        JaxmapError: no such file, not a raster, without georeference, truncated, or elsewhere.
+        JaxmapError: the file is missing, not a raster, truncated, not georeferenced, or elsewhere.
     """
     with _opened(path) as raster:
         T_crs_pixel = np.array(raster.transform, np.float64).reshape(3, 3)
         if np.array_equal(T_crs_pixel, np.eye(3)) or abs(np.linalg.det(T_crs_pixel)) == 0:
             raise JaxmapError(
-                "the raster says not where it lies", where=path, fix="give a GeoTIFF, or a world file beside it"
+                "the raster is not georeferenced", where=path, fix="give a GeoTIFF, or a world file beside it"
             )
         own = crs or (raster.crs.to_wkt() if raster.crs else None)
         covered = _covered(T_crs_pixel, raster.width, raster.height, own)
@@ -72,6 +88,51 @@ def read_window(path: Path, place: Extent, crs: str | None = None, margin: float
         bands, valid = _read(raster, window, path)
         shift = np.array([[1.0, 0, window.col_off], [0, 1, window.row_off], [0, 0, 1]])
         return RasterWindow(bands, valid, T_crs_pixel @ shift, own or place.crs, _palette(raster), notes)
+
+
+def read_heights(path: Path, place: Extent, *, crs: str | None = None, margin: float = 0.0) -> HeightRaster:
+    """Reads the part of a digital elevation model that lies over a map.
+
+    Args:
+        path: the raster, one band of heights in metres.
+        place: the extent of the map.
+        crs: the raster's coordinate reference system, in place of the file's own.
+        margin: added on each side of the map, in its units.
+
+    Raises:
+        JaxmapError: what `read_window` refuses, another number of bands, or no height at all.
+    """
+    window = read_window(path, place, crs, margin)
+    if len(window.bands) != 1 or window.palette is not None:
+        kind = "colours of a palette" if window.palette is not None else f"{len(window.bands)} bands"
+        raise JaxmapError(f"{kind}, one band of heights is expected", where=path, fix="give an elevation model")
+    height_m = np.where(window.valid, window.bands[0].astype(np.float64), np.nan)
+    if not np.isfinite(height_m).any():
+        raise JaxmapError("no height lies over the map", where=path, fix="check nodata and extent of the raster")
+    return HeightRaster(height_m, window.T_crs_pixel, window.crs, window.notes)
+
+
+def read_picture(
+    path: Path, place: Extent, crs: str | None = None
+) -> tuple[UInt8[np.ndarray, "H W 3"], Float64[np.ndarray, "3 3"], str | None]:
+    """Reads the part of an orthomosaic that lies over a map: RGB, `T_crs_pixel`, and coordinate reference system.
+
+    Grey becomes RGB; more than 8 bits are stretched from the 2nd to the 98th percentile.
+
+    Raises:
+        JaxmapError: what `read_window` refuses.
+    """
+    window = read_window(path, place, crs)
+    bands = window.bands[:3] if len(window.bands) >= 3 else np.repeat(window.bands[:1], 3, axis=0)
+    if window.palette is not None:
+        table = np.zeros((256, 3), np.uint8)
+        for value, colour in window.palette.items():
+            table[value & 255] = colour
+        bands = np.moveaxis(table[bands[0].astype(np.uint8)], -1, 0)
+    elif bands.dtype != np.uint8:
+        low, high = np.percentile(bands[:, window.valid], [2, 98]) if window.valid.any() else (0.0, 1.0)
+        bands = np.clip((np.nan_to_num(bands.astype(np.float64)) - low) / max(high - low, 1e-9) * 255, 0, 255)
+    return np.moveaxis(bands, 0, -1).astype(np.uint8), window.T_crs_pixel, window.crs
 
 
 @contextmanager
@@ -88,7 +149,7 @@ def _opened(path: Path) -> Iterator[DatasetReader]:
                 yield raster
         except RasterioError as error:
             raise JaxmapError(
-                "not a readable raster: damaged, cut off or no image", where=path, fix="give a whole GeoTIFF"
+                "not a readable raster: damaged, cut off or not an image", where=path, fix="give a whole GeoTIFF"
             ) from error
 
 
@@ -99,7 +160,7 @@ def _covered(T_crs_pixel: np.ndarray, width: int, height: int, crs: str | None) 
 
 
 def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...]:
-    """What is assumed of unknown systems.
+    """Notes on an unknown coordinate reference system.
 
     Raises:
         JaxmapError: the two do not overlap.
@@ -107,8 +168,8 @@ def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...
     there = extent_in(covered, place.crs, path)
     if not there.overlaps(place):
         unknown = {
-            (False, True): "; the raster has no CRS, say it with --truth-crs",
-            (True, False): "; the map has no CRS, say it with --crs",
+            (False, True): "; the raster has no CRS, name it with --truth-crs",
+            (True, False): "; the map has no CRS, name it with --crs",
         }.get((covered.crs is not None, place.crs is not None), "; check that both are of one site")
         raise JaxmapError(
             f"the raster does not lie over the map: it reaches from {there.text()}, the map from {place.text()} "
@@ -124,7 +185,7 @@ def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...
 
 
 def _window(raster: DatasetReader, T_crs_pixel: np.ndarray, wanted: Extent) -> Window:
-    """The whole pixels that hold a box, with some to spare."""
+    """The window of whole pixels that covers a box, with a margin."""
     from rasterio.windows import Window
 
     west, south, east, north = wanted[:4]

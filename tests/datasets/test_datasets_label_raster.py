@@ -9,15 +9,16 @@ from rasterio.enums import ColorInterp
 from truth_files import CRS, SITE, class_map, write_raster
 
 from jaxmap.datasets.crs import Extent
-from jaxmap.datasets.label_coding import (
+from jaxmap.datasets.label_raster import (
     DEFAULT_CODING,
     LabelCoding,
     choose_coding,
     make_coding,
     parse_coding,
     read_coding,
+    read_label_orthomosaic,
 )
-from jaxmap.datasets.orthomosaic import read_label_orthomosaic, read_picture
+from jaxmap.datasets.rasters import read_picture
 from jaxmap.datasets.rock_list import draw_rocks, find_rock_lists, read_rock_lists
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import make_cells
@@ -76,7 +77,7 @@ def rotated(angle_rad: float, pixel_m: float) -> tuple[np.ndarray, Affine]:
     return turned, transform
 
 
-def test_a_rotated_raster_says_the_same(tmp_path, plain):
+def test_a_rotated_raster_gives_the_same_labels(tmp_path, plain):
     labels, transform = rotated(0.5, 0.05)
     read = read_label_orthomosaic(write_raster(tmp_path / "r.tif", labels, 0, 0, 0, transform=transform), PLACE)
     there, here = shares(read), shares(plain)
@@ -87,7 +88,7 @@ def test_a_rotated_raster_says_the_same(tmp_path, plain):
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:3857"])
-def test_a_raster_of_another_system_says_the_same(tmp_path, plain, crs):
+def test_a_reprojected_raster_gives_the_same_labels(tmp_path, plain, crs):
     from rasterio.warp import calculate_default_transform, reproject
 
     fine = np.kron(blobs(), np.ones((4, 4), np.uint8))
@@ -139,7 +140,7 @@ def test_nodata_and_transparency_are_unlabelled(tmp_path, plain):
     np.testing.assert_array_equal(read_label_orthomosaic(path, PLACE).labels, plain.labels)
 
 
-def test_what_is_assumed_of_an_unknown_system_is_noted(tmp_path, plain):
+def test_assumptions_on_an_unknown_system_are_noted(tmp_path, plain):
     bare = write_raster(tmp_path / "bare.tif", blobs(), WEST, NORTH, 0.05, crs=None)
     read = read_label_orthomosaic(bare, PLACE)
     assert read.notes == ("bare.tif has no CRS: taken for the map's, EPSG:32631",)
@@ -147,33 +148,33 @@ def test_what_is_assumed_of_an_unknown_system_is_noted(tmp_path, plain):
     known = write_raster(tmp_path / "known.tif", blobs(), WEST, NORTH, 0.05)
     read = read_label_orthomosaic(known, PLACE._replace(crs=None))
     assert read.notes == ("the map has no CRS: taken for that of known.tif, EPSG:32631",)
-    told = read_label_orthomosaic(bare, PLACE, crs="EPSG:32631")
-    assert told.notes == () and told.crs == "EPSG:32631"
+    named = read_label_orthomosaic(bare, PLACE, crs="EPSG:32631")
+    assert named.notes == () and named.crs == "EPSG:32631"
 
 
-def test_faults_of_a_raster_are_told(tmp_path):
+def test_faults_of_a_raster_are_reported(tmp_path):
     labels = blobs()
     away = write_raster(tmp_path / "away.tif", labels, WEST + 500, NORTH, 0.05)
     with pytest.raises(JaxmapError, match="does not lie over the map: it reaches from 596183 to 596191 east") as e:
         read_label_orthomosaic(away, PLACE)
     assert "the map from 595683 to 595691 east" in str(e.value) and "EPSG:32631" in str(e.value)
     other = write_raster(tmp_path / "other.tif", labels, 0.0, 8.0, 0.05, crs=None)
-    with pytest.raises(JaxmapError, match="no CRS, say it with --truth-crs"):
+    with pytest.raises(JaxmapError, match="no CRS, name it with --truth-crs"):
         read_label_orthomosaic(other, PLACE)
-    with pytest.raises(JaxmapError, match=r"label values that mean nothing: 7 \(12 px\), 9 \(1 px\)"):
+    with pytest.raises(JaxmapError, match=r"label values without a class: 7 \(12 px\), 9 \(1 px\)"):
         strange = labels.copy()
         strange[50, 50:62], strange[60, 60] = 7, 9
         read_label_orthomosaic(write_raster(tmp_path / "s.tif", strange, WEST, NORTH, 0.05), PLACE)
-    with pytest.raises(JaxmapError, match="3 bands, one of labels is expected"):
+    with pytest.raises(JaxmapError, match="3 bands, one band of labels is expected"):
         read_label_orthomosaic(write_raster(tmp_path / "b.tif", np.stack([labels] * 3), WEST, NORTH, 0.05), PLACE)
     with pytest.raises(JaxmapError, match="fractions, not labels"):
         halves = labels.astype(np.float32) / 2
         read_label_orthomosaic(write_raster(tmp_path / "h.tif", halves, WEST, NORTH, 0.05), PLACE)
-    with pytest.raises(JaxmapError, match="says not where it lies"):
+    with pytest.raises(JaxmapError, match="not georeferenced"):
         read_label_orthomosaic(write_raster(tmp_path / "n.tif", labels, 0, 0, 0, transform=Affine.identity()), PLACE)
     with pytest.raises(JaxmapError, match="no such file"):
         read_label_orthomosaic(tmp_path / "nowhere.tif", PLACE)
-    with pytest.raises(UsageError, match="knows no class 'bush'"):
+    with pytest.raises(UsageError, match="has no class 'bush'"):
         plain = write_raster(tmp_path / "p.tif", labels, WEST, NORTH, 0.05)
         read_label_orthomosaic(plain, PLACE, target="bush")
     with pytest.raises(JaxmapError, match="unknown coordinate reference system 'EPSG:1'"):
@@ -185,8 +186,8 @@ def test_every_cut_of_a_raster_is_one_line(tmp_path):
     damaged = tmp_path / "damaged.tif"
     for size in (0, 3, 40, len(whole) // 3, len(whole) // 2, len(whole) - 200):
         damaged.write_bytes(whole[:size])
-        # Where the cut has taken the georeference, that is what is told.
-        with pytest.raises(JaxmapError, match="not a readable raster|no CRS|says not where") as fault:
+        # A cut may take the georeference alone.
+        with pytest.raises(JaxmapError, match="not a readable raster|no CRS|not georeferenced") as fault:
             read_label_orthomosaic(damaged, PLACE)
         assert "\n" not in str(fault.value)
     damaged.write_text("not a picture at all\n" * 50)
@@ -198,13 +199,13 @@ def test_every_cut_of_a_raster_is_one_line(tmp_path):
     ("words", "what"),
     [
         (["3"], "is not CODE=CLASS"),
-        (["x=rock"], "is no code"),
-        (["3="], "names no class"),
+        (["x=rock"], "is not a code"),
+        (["3="], "does not name a class"),
         (["3=rock", "#ffffff=sand"], "numbers and colours are mixed"),
-        (["*=rock"], "no code is named"),
+        (["*=rock"], "no code is given"),
     ],
 )
-def test_codings_that_mean_nothing_are_refused(words, what):
+def test_invalid_codings_are_refused(words, what):
     with pytest.raises(UsageError, match=what.replace("*", r"\*")):
         parse_coding(words)
 
@@ -213,12 +214,16 @@ def test_codings_from_files(tmp_path):
     path = tmp_path / "palette.yaml"
     path.write_text("0: unlabelled\n3: rock\n'*': sand\n")
     assert read_coding(path) == LabelCoding({0: "unlabelled", 3: "rock"}, rest="sand")
-    for text, what in (("- 1\n", "holds no codes"), ("a: [", "not YAML"), ("1: {}\n", "names no class")):
+    for text, what in (
+        ("- 1\n", "no keys and values"),
+        ("a: [", "malformed YAML"),
+        ("1: {}\n", "does not name a class"),
+    ):
         path.write_text(text)
         with pytest.raises(UsageError, match=what):
             read_coding(path)
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match="not YAML"):
+    with pytest.raises(UsageError, match="not a text file"):
         read_coding(path)
     with pytest.raises(UsageError, match="cannot be read"):
         read_coding(tmp_path)
@@ -275,7 +280,7 @@ def test_one_rock_alone_and_lists_of_another_system(tmp_path):
         ("1 2\n", "do not lie over the map: they reach from"),
     ],
 )
-def test_faults_of_lists_are_told(tmp_path, text, what):
+def test_faults_of_lists_are_reported(tmp_path, text, what):
     (tmp_path / "rocks.txt").write_text(text)
     with pytest.raises(JaxmapError, match=what):
         draw_rocks(read_rock_lists([tmp_path / "rocks.txt"]), PLACE)
