@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from agreement.maps import MISS, NOTHING, UNKNOWN, Seen, TwoMaps
 from jaxtyping import Bool, Float, Int
 
-from agreement.maps import MISS, NOTHING, UNKNOWN, Seen, TwoMaps
 from jaxmap.fusion.params import FusionParams
 from jaxmap.geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
 from jaxmap.types import GridSpec, StereoCamera
