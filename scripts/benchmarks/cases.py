@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +25,8 @@ from jaxmap.stereo.rectify import StereoRig, make_rectifier, make_stereo_rig, re
 HYPOTHESES = {"small": 128, "medium": 512, "large": 2048}
 SEEN_PX = {"small": (192, 256), "medium": ours.NETWORK_PX, "large": (768, 1024)}
 """Height and width of the image that the network sees."""
+LOGITS_PX = {"small": (192, 256), "medium": (384, 512), "large": (512, 512)}
+BATCH = {"small": 2, "medium": 4, "large": 8}
 FUSED_BEFORE = {"small": 50, "medium": 500, "large": 2000}
 FRAMES = {"small": 8, "medium": 24, "large": 72}
 RATE_SHARE = 0.45
@@ -215,6 +218,30 @@ def network(size: str) -> Case:
     return case_of(prepared, Amount(height_px * width_px, "pixels"), Amount(1, "images"), beside)
 
 
+def deeplab(backbone: str, size: str) -> Case:
+    """Logits of one image by the same network in other libraries."""
+    images = np.random.default_rng(0).integers(0, 256, (1, *LOGITS_PX[size], 3), np.uint8)
+    beside = [
+        Peer(name, partial(make, backbone, images, usable_cores()), modules=modules)
+        for name, (make, modules) in networks.PEERS.items()
+    ]
+    prepared, gflop = ours.logits(backbone, images)
+    case = case_of(prepared, Amount(images[..., 0].size, "pixels"), Amount(gflop, "GFLOP"), beside)
+    return replace(case, facts=lambda: {"GFLOP/s of a product of matrices": ours.product_rate()})
+
+
+def train(size: str) -> Case:
+    """One training step of MobileNetV2 on a batch of images of 384 x 384."""
+    images = np.random.default_rng(0).integers(0, 256, (BATCH[size], 384, 384, 3), np.uint8)
+    labels = (images[..., 0] // 86).astype(np.uint8)
+    beside = [
+        Peer(name, partial(networks.training_step, layout, images, labels, usable_cores()), modules=networks.TORCH)
+        for name, layout in (("torch eager", "contiguous_format"), ("torch channels-last", "channels_last"))
+    ]
+    amount = Amount(BATCH[size], "images")
+    return case_of(ours.training_step(images, labels), amount, amount, beside)
+
+
 def step(labeller: str, size: str) -> Case:
     """One frame into 40 x 40 x 4 m, by the size of the voxels."""
     scene, gated = make_scene(), size == "medium"
@@ -258,6 +285,9 @@ GROUPS = {
     "integrate": Group("the points of one frame into voxels of 0.2 m, by points", integrate),
     "fuse": Group("carving and integration of 786,432 points into 40 x 40 x 4 m, by voxels", fuse),
     "network": Group("MobileNetV2 on an image of 1024 x 768, by the pixels that it sees", network),
+    "deeplab_mobilenet_v2": Group("logits of one image, by its pixels", partial(deeplab, "mobilenet_v2")),
+    "deeplab_resnet18": Group("the same on ResNet-18", partial(deeplab, "resnet18")),
+    "train": Group("a training step on MobileNetV2, images of 384 x 384, by the batch", train),
     "step_none": Group("the step without labels: project, carve, fuse", partial(step, "none")),
     "step_plane": Group("the step: project, label by the MLESAC plane, carve, fuse", partial(step, "plane")),
     "step_deeplab": Group("the step: project, label by MobileNetV2, carve, fuse", partial(step, "deeplab")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import sys
 from collections.abc import Callable
@@ -90,9 +91,33 @@ def _onnx(backbone: str, images: np.ndarray) -> bytes:
     return content.getvalue()
 
 
+TORCH = ("torch", "segmentation_models_pytorch")
 PEERS: dict[str, tuple[Callable[[str, np.ndarray, int], Run], tuple[str, ...]]] = {
-    "torch channels-last": (torch_eager, ("torch", "segmentation_models_pytorch")),
-    "onnxruntime": (onnx_session, ("torch", "segmentation_models_pytorch", "onnx", "onnxruntime")),
-    "openvino f32": (openvino_request, ("torch", "segmentation_models_pytorch", "onnx", "openvino")),
+    "torch channels-last": (torch_eager, TORCH),
+    "onnxruntime": (onnx_session, (*TORCH, "onnx", "onnxruntime")),
+    "openvino f32": (openvino_request, (*TORCH, "onnx", "openvino")),
 }
 """How to prepare each peer for a backbone, images uint8 (B, H, W, 3) and threads; and the modules that it needs."""
+
+
+def training_step(layout: str, images: np.ndarray, labels: np.ndarray, threads: int) -> Run:
+    """Forward, backward and AdamW of MobileNetV2 in torch, without dropout, in one order of memory."""
+    import torch
+
+    torch.set_num_threads(threads)
+    order = getattr(torch, layout)
+    inputs, truth = torch_images(images).contiguous(memory_format=order), torch.from_numpy(labels).long()
+    network = copy.deepcopy(torch_network("mobilenet_v2")).train().to(memory_format=order)
+    for module in network.modules():
+        if isinstance(module, torch.nn.Dropout):
+            module.p = 0.0
+    optimiser = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=1e-4)
+
+    def run() -> float:
+        optimiser.zero_grad()
+        loss = torch.nn.functional.cross_entropy(network(inputs), truth)
+        loss.backward()
+        optimiser.step()
+        return loss.item()
+
+    return run

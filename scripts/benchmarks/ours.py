@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -19,28 +19,36 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import optax
+from harness import timed
 from scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_poses
 
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
 from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.query import top_down
 from jaxmap.fusion.view import Reach, view_of
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
+from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.sequence import prepare_frames, run_sequence
 from jaxmap.mapping.step import Mapper, MapperParams, compile_step, make_mapper
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import initial_weights
+from jaxmap.models.deeplab import Weights, inference_network, initial_weights, training_form
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions
-from jaxmap.types import Frame, GridSpec, PointLabels, VoxelMap, make_voxel_map
+from jaxmap.training.losses import total_loss
+from jaxmap.training.optimiser import is_statistic
+from jaxmap.training.options import LossOptions
+from jaxmap.tuning.pull_back import make_pull_back, map_gradient
+from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_grid, make_voxel_map
 
 NETWORK_PX = (384, 512)
 """Height and width that the network sees."""
@@ -64,8 +72,8 @@ def prepare(function: Callable[..., Any], *arguments: Any) -> Prepared:
     return Prepared(lambda: jax.block_until_ready(executable(*arguments)), compile_s, temporary_bytes)
 
 
-def prepare_update(function: Callable[..., Any], tensor: jax.Array, *arguments: Any) -> Prepared:
-    """Compiles an update of a tensor, which is donated: each run updates the result of the one before."""
+def prepare_update(function: Callable[..., Any], tensor: Any, *arguments: Any) -> Prepared:
+    """Compiles an update of arrays, which are donated: each run updates the result of the one before."""
     executable, compile_s, temporary_bytes = _compile(jax.jit(function, donate_argnums=0).lower(tensor, *arguments))
     prepared = Prepared(lambda: None, compile_s, temporary_bytes, tensor)
 
@@ -170,10 +178,49 @@ def fuse_frame(scene: Scene, size: str) -> Prepared:
 
 
 @cache
-def network_model() -> SavedModel:
-    """DeepLabv3+ on MobileNetV2 in the design of segmentation_models_pytorch, with initial weights."""
-    architecture = torch_architecture("mobilenet_v2", ROVER_CLASSES)
+def network_model(backbone: str = "mobilenet_v2") -> SavedModel:
+    """DeepLabv3+ in the design of segmentation_models_pytorch, with initial weights."""
+    architecture = torch_architecture(backbone, ROVER_CLASSES)
     return SavedModel(architecture, initial_weights(architecture, KEY), "network")
+
+
+def logits(backbone: str, images: np.ndarray) -> tuple[Prepared, float]:
+    """The network as `jaxmap segment` runs it on uint8 (B, H, W, 3), and the GFLOP that the compiler counts."""
+    model = network_model(backbone)
+    network = inference_network(model.architecture, model.weights)
+    executable, compile_s, temporary_bytes = _compile(jax.jit(network.apply).lower(network.weights, images))
+    prepared = Prepared(lambda: executable(network.weights, images).block_until_ready(), compile_s, temporary_bytes)
+    return prepared, executable.cost_analysis()["flops"] / 1e9
+
+
+def training_step(images: np.ndarray, labels: np.ndarray) -> Prepared:
+    """Forward, backward and AdamW on images uint8 (B, H, W, 3) and labels (B, H, W); batch norm by the batch."""
+    model = network_model()
+    # The peers are timed without dropout.
+    network = training_form(replace(model.architecture, dropout=0.0), ("backbone", "aspp", "decoder"))
+    optimiser = optax.adamw(1e-3, weight_decay=1e-4)
+
+    def loss(trained: Weights, fixed: Weights) -> tuple[jax.Array, Weights]:
+        logits, statistics = network({**trained, **fixed}, images, KEY)
+        return total_loss(logits, labels, jnp.ones(logits.shape[-1]), LossOptions()), statistics
+
+    def step(state: tuple[Weights, Weights, Any]) -> tuple[Weights, Weights, Any]:
+        trained, fixed, memory = state
+        gradient, statistics = jax.grad(loss, has_aux=True)(trained, fixed)
+        updates, memory = optimiser.update(gradient, memory, trained)
+        return optax.apply_updates(trained, updates), {**fixed, **statistics}, memory
+
+    trained = {name: jnp.array(value) for name, value in model.weights.items() if not is_statistic(name)}
+    fixed = {name: jnp.array(value) for name, value in model.weights.items() if is_statistic(name)}
+    return prepare_update(step, (trained, fixed, optimiser.init(trained)))
+
+
+def product_rate() -> float:
+    """GFLOP/s of a float32 product of matrices, the best of several: what this machine reaches."""
+    size = 1024
+    left = jnp.ones((size, size))
+    prepared = prepare(jnp.dot, left, left)
+    return 2e-9 * size**3 / min(timed(prepared.run) for _ in range(15))
 
 
 @cache
@@ -252,3 +299,36 @@ def map_sequence(scene: Scene, folder: Path, frames: int, size: str) -> Prepared
             jax.block_until_ready(voxel_map.log_odds)
 
     return Prepared(run, compile_s, temporary_bytes)
+
+
+def _scored_mapper(camera: StereoCamera) -> tuple[Mapper, MapperParams]:
+    """A mapper of frames with soft labels into 8 x 12 x 1.4 m, and its parameters."""
+    grid = make_grid([-4, -1, -0.4], [4, 11, 1.0], (0.1, 0.1, 0.2))
+    mapper = make_mapper(camera, grid, make_files_labeller(ROVER_CLASSES, soft=True), RULE, (0.3, 6.0))
+    return mapper, MapperParams(camera, make_fusion_params(ROVER_CLASSES))
+
+
+def _rock_score(voxel_map: VoxelMap, params: MapperParams) -> jax.Array:
+    """The probability of rock, summed over the map's columns."""
+    top = top_down(voxel_map, params.fusion, RULE)
+    return jnp.where(top.observed, top.probability[ROVER_CLASSES.index("rock")], 0.0).sum()
+
+
+def gradient_by_pull_back(camera: StereoCamera, frames: Iterable[Frame]) -> tuple[Any, int]:
+    """The gradient of the map's score in all parameters, and the bytes of temporary memory that the compiler counts."""
+    mapper, params = _scored_mapper(camera)
+    functions = make_pull_back(mapper, _rock_score)
+    lowered = functions.lower(params, mapper.init().log_odds, next(iter(frames)), params, KEY, 0)
+    temporary_bytes = lowered.compile().memory_analysis().temp_size_in_bytes
+    return map_gradient(mapper, frames, params, KEY, _rock_score, pull_back=functions).gradient, temporary_bytes
+
+
+def gradient_by_scan(camera: StereoCamera, frames: Frame) -> tuple[Any, int]:
+    """The same by reverse mode through the scan; the frames lie in memory side by side."""
+    mapper, params = _scored_mapper(camera)
+
+    def loss(params: MapperParams, frames: Frame) -> jax.Array:
+        return _rock_score(mapper.scan(mapper.init(), frames, params, KEY)[0], params)
+
+    compiled = jax.jit(jax.grad(loss)).lower(params, frames).compile()
+    return compiled(params, frames), compiled.memory_analysis().temp_size_in_bytes

@@ -1,11 +1,11 @@
 """Shows that the gradient of a map's score takes the memory of one frame, however many frames made the map.
 
-    python scripts/pull_back_memory.py [--frames 1 10 50 200] [--plain 1 10 50]
+    python scripts/benchmarks/pull_back_memory.py [--frames 1 10 50 200] [--plain 1 10 50]
 
 For each number of frames, two processes take the same gradient: one by the pull-back (`map_gradient`), one by plain
-reverse mode through the scan. The frames are views of a slope with soft labels, made anew whenever they are asked for.
-Printed are the compiler's count of temporary memory, the peak resident size of each process, and how far the two
-gradients are apart.
+reverse mode through the scan. The frames are views of a slope with soft labels, made anew whenever they are read.
+Prints one table: the compiler's count of temporary memory, the peak resident size of each process, and the relative
+difference of the two gradients.
 """
 
 from __future__ import annotations
@@ -21,36 +21,27 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import ours
 
-from jaxmap.fusion.params import FusionRule, make_fusion_params
-from jaxmap.fusion.query import top_down
 from jaxmap.host.memory import peak_resident_mib
-from jaxmap.labellers.files import make_files_labeller
-from jaxmap.labels import ROVER_CLASSES
-from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
-from jaxmap.tuning.pull_back import make_pull_back, map_gradient
-from jaxmap.types import Frame, VoxelMap, make_grid, make_stereo_camera
+from jaxmap.types import Frame, make_stereo_camera
 
 HEIGHT_PX, WIDTH_PX = 240, 320
-DEPTH_RANGE_M = (0.3, 6.0)
-STEP_M = 0.02
 CAMERA = make_stereo_camera(
     fx_px=260, cx_px=159.5, cy_px=119.5, baseline_m=0.12, width_px=WIDTH_PX, height_px=HEIGHT_PX
 )
-PARAMS = MapperParams(CAMERA, make_fusion_params(ROVER_CLASSES))
-KEY = jax.random.key(0)
 
 
 def make_frame(index: int) -> Frame:
-    """A view of rough ground, 1 m below the camera, which moves on and looks down by 20 degrees."""
+    """A view of rough ground, 1 m below the camera, which moves ahead by 2 cm a frame and looks down by 20 degrees."""
     rng = np.random.default_rng(index)
     row = (np.arange(HEIGHT_PX) - float(CAMERA.cy_px))[:, None] / float(CAMERA.fy_px)
     down = np.cos(0.35) * row + np.sin(0.35)
     depth_m = np.where(down > 0.05, 1.0 / np.maximum(down, 0.05), np.nan) * rng.normal(1, 0.01, (HEIGHT_PX, WIDTH_PX))
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, -np.sin(0.35), np.cos(0.35)], [0, -np.cos(0.35), -np.sin(0.35)]]
-    pose[:3, 3] = [0.0, index * STEP_M, 1.0]
-    soft = rng.dirichlet(np.ones(len(ROVER_CLASSES)), (HEIGHT_PX, WIDTH_PX))
+    pose[:3, 3] = [0.0, index * 0.02, 1.0]
+    soft = rng.dirichlet(np.ones(3), (HEIGHT_PX, WIDTH_PX))
     return Frame(
         jnp.asarray(0.12 * 260 / depth_m, jnp.float32),
         jaxlie.SE3.from_matrix(jnp.asarray(pose, jnp.float32)),
@@ -59,7 +50,7 @@ def make_frame(index: int) -> Frame:
 
 
 class Frames:
-    """So many frames, made whenever they are gone through."""
+    """So many frames, made whenever they are read."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -68,48 +59,16 @@ class Frames:
         return map(make_frame, range(self._count))
 
 
-def score(voxel_map: VoxelMap, params: MapperParams) -> jax.Array:
-    """How sure the map is that there is rock, summed over its columns."""
-    view = top_down(voxel_map, params.fusion, FusionRule())
-    return jnp.where(view.observed, view.probability[2], 0.0).sum()
-
-
-def mapper() -> Mapper:
-    """One grid for all numbers of frames."""
-    grid = make_grid([-4, -1, -0.4], [4, 11, 1.0], (0.1, 0.1, 0.2))
-    return make_mapper(CAMERA, grid, make_files_labeller(ROVER_CLASSES, soft=True), FusionRule(), DEPTH_RANGE_M)
-
-
-def by_pull_back(count: int) -> tuple[Any, int]:
-    """The gradient, and the compiler's count of temporary memory."""
-    step, frames = mapper(), Frames(count)
-    functions = make_pull_back(step, score)
-    lowered = functions.lower(PARAMS, step.init().log_odds, make_frame(0), PARAMS, KEY, 0)
-    temporary = lowered.compile().memory_analysis().temp_size_in_bytes
-    return map_gradient(step, frames, PARAMS, KEY, score, pull_back=functions).gradient, temporary
-
-
-def by_scan(count: int) -> tuple[Any, int]:
-    """The same by reverse mode through the scan; the frames lie in memory side by side."""
-    step = mapper()
-    frames = jax.tree.map(lambda *leaves: jnp.stack(leaves), *Frames(count))
-
-    def loss(params: MapperParams, frames: Frame) -> jax.Array:
-        return score(step.scan(step.init(), frames, params, KEY)[0], params)
-
-    compiled = jax.jit(jax.grad(loss)).lower(PARAMS, frames).compile()
-    return compiled(PARAMS, frames), compiled.memory_analysis().temp_size_in_bytes
-
-
-WAYS = {"pull-back": by_pull_back, "scan": by_scan}
-
-
 def measure(way: str, count: int) -> dict[str, Any]:
-    """What one process took."""
-    gradient, temporary = WAYS[way](count)
-    leaves = [np.asarray(leaf).ravel().tolist() for leaf in jax.tree.leaves(gradient)]
+    """The gradient, the compiler's count of temporary memory and the peak resident size of this process."""
+    if way == "scan":
+        frames = jax.tree.map(lambda *leaves: jnp.stack(leaves), *Frames(count))
+        gradient, temporary = ours.gradient_by_scan(CAMERA, frames)
+    else:
+        gradient, temporary = ours.gradient_by_pull_back(CAMERA, Frames(count))
+    numbers = np.concatenate([np.asarray(leaf).ravel() for leaf in jax.tree.leaves(gradient)])
     return {
-        "gradient": [number for leaf in leaves for number in leaf],
+        "gradient": numbers.tolist(),
         "temporary_mib": temporary / 2**20,
         "resident_mib": peak_resident_mib(),
     }
@@ -129,7 +88,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, nargs="+", default=[1, 10, 50, 200])
     parser.add_argument("--plain", type=int, nargs="*", help="numbers of frames for the scan; by default all")
-    parser.add_argument("--measure", choices=WAYS, help=argparse.SUPPRESS)
+    parser.add_argument("--measure", choices=("pull-back", "scan"), help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.measure:
         print(json.dumps(measure(given.measure, given.frames[0])))
@@ -137,13 +96,14 @@ def main() -> None:
     print(f"{'':8s}{'temporary memory, MiB':>24s}{'peak resident, MiB':>24s}{'gradients differ by':>22s}")
     print(f"{'frames':8s}{'pull-back':>12s}{'scan':>12s}{'pull-back':>12s}{'scan':>12s}{'(relative)':>22s}")
     for count in given.frames:
-        ours = in_process("pull-back", count)
-        plain = in_process("scan", count) if given.plain is None or count in given.plain else None
+        pulled, plain = in_process("pull-back", count), None
+        if given.plain is None or count in given.plain:
+            plain = in_process("scan", count)
         row = f"{count:<8d}"
         for key in ("temporary_mib", "resident_mib"):
-            row += f"{ours[key]:12.1f}" + (f"{plain[key]:12.1f}" if plain else f"{'-':>12s}")
+            row += f"{pulled[key]:12.1f}" + (f"{plain[key]:12.1f}" if plain else f"{'-':>12s}")
         if plain:
-            one, other = np.array(ours["gradient"]), np.array(plain["gradient"])
+            one, other = np.array(pulled["gradient"]), np.array(plain["gradient"])
             row += f"{np.abs(one - other).max() / np.abs(other).max():22.1e}"
         print(row, flush=True)
 
