@@ -35,7 +35,7 @@ LIBRARIES = (
     *("octomap-python", "open3d", "torch", "onnxruntime", "openvino"),
 )
 WIDTH = 40
-HEADER = f"{'':20s} {'times in ms':{WIDTH}s} {'median':>9s} {'spread':>9s} {'ratio':>8s} {'target':>7s} {'gate':>7s}"
+HEADER = f"{'':23s} {'times in ms':{WIDTH}s} {'median':>9s} {'spread':>9s} {'ratio':>8s} {'target':>7s} {'gate':>7s}"
 
 
 def main() -> int:
@@ -82,7 +82,7 @@ def run_cases(
     from cases import GROUPS
 
     if given.list:
-        parser.exit(message="".join(f"{name:14s} {group.title}\n" for name, group in GROUPS.items()))
+        parser.exit(message="".join(f"{name:17s} {group.title}\n" for name, group in GROUPS.items()))
     if unknown := set(given.only or []) - GROUPS.keys():
         parser.error(f"no group {', '.join(sorted(unknown))}; there are {', '.join(GROUPS)}")
     cv2.setNumThreads(given.threads)
@@ -112,7 +112,7 @@ def print_case(name: str, case: dict[str, Any], baseline: dict[str, Any]) -> Ite
     notes = [f"{grown['count']:,.0f} {grown['unit']}", f"{case['work_per_s']:,.0f} {work['unit']}/s"]
     notes += [f"compiled in {case['compile_s']:.2f} s"] if "compile_s" in case else []
     notes += [f"{case['temporary_mib']:.1f} MiB temporary"] if "temporary_mib" in case else []
-    print(f"{name:20s} {'jaxmap':{WIDTH}s} {_times(case)} {'':24s}  {'; '.join(notes)}", flush=True)
+    print(f"{name:23s} {'jaxmap':{WIDTH}s} {_times(case)} {'':24s}  {'; '.join(notes)}", flush=True)
     for peer, figures in case["peers"].items():
         ratio, limit, gate, verdict = figures["ratio"], figures.get("limit"), "", ""
         if limit is not None and figures["gated"]:
@@ -124,11 +124,11 @@ def print_case(name: str, case: dict[str, Any], baseline: dict[str, Any]) -> Ite
         if limit is not None and ratio > limit:
             verdict = f"{verdict}, target missed".removeprefix(", ")
         target = "" if limit is None else f"{limit:.3g}"
-        print(f"{'':20s} {peer:{WIDTH}s} {_times(figures)} {ratio:8.3g} {target:>7s} {gate:>7s}  {verdict}")
+        print(f"{'':23s} {peer:{WIDTH}s} {_times(figures)} {ratio:8.3g} {target:>7s} {gate:>7s}  {verdict}")
     for peer, modules in case["missing"].items():
-        print(f"{'':20s} {peer:{WIDTH}s} left out: {', '.join(modules)} not installed")
+        print(f"{'':23s} {peer:{WIDTH}s} left out: {', '.join(modules)} not installed")
     for fact, value in case["facts"].items():
-        print(f"{'':20s} {fact}: {value:.3g}")
+        print(f"{'':23s} {fact}: {value:.3g}")
 
 
 def _times(figures: dict[str, Any]) -> str:

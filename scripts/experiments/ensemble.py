@@ -1,37 +1,29 @@
-"""What the ensemble is worth and what it costs: does it tell missed rocks, and which of its errors does?
+"""What the ensemble is worth and what it costs: does it find missed rocks, and which of its errors does?
 
-    python scripts/ensemble.py TRAVERSE... [--members 8]     # sample:traverse, or folders that hold Part1 and gt
+    python scripts/experiments/ensemble.py TRAVERSE... [--members 8]   # sample:traverse, or folders with Part1 and gt
 
 Each traverse is mapped once without an ensemble and once for each spread: errors of the poses alone, of the disparities
-alone, of the sensor model alone, and all of them. Printed is how well the layer ranks the cells of 0.2 m that are rock
-among those that the map does not call rock (area under the ROC curve, average precision), how many it expects and how
-many there are, its calibration, and the time and memory of each member.
+alone, of the sensor model alone, and all of them. Prints one table: how well the layer ranks the cells of 0.2 m that are
+rock among those that the map does not call rock (area under the ROC curve, average precision), its calibration error,
+how many it expects and how many there are, and the time and memory of a member. `map alone` ranks cells by the share of
+their columns that the map calls rock.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import jax
+import jax.numpy as jnp
 import numpy as np
+from common import Frames, Scored, Table, Traverse, command_line, fuse, parse
 
 from jaxmap.ensemble.layer import ensemble_layers
 from jaxmap.ensemble.options import EnsembleOptions
-from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
-from jaxmap.host.cache import keep_compiled_programs
-from jaxmap.host.files import bundled
-from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
-from jaxmap.runs.config import DepthConfig, MapConfig
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.runs.mapping_plan import plan_run
+from jaxmap.runs.config import MapConfig
+from jaxmap.runs.mapping_plan import Plan
+from jaxmap.types import VoxelMap
 
-CELL_M, RANGE_M = 0.2, 8.0
 NO_POSES = dict(position_sigma_m=0.0, heading_sigma_rad=0.0, tilt_sigma_rad=0.0)
 NO_DISPARITY = dict(disparity_sigma_px=0.0)
 NO_SENSOR = dict(increment_sigma=0.0, temperature_sigma=0.0, label_bias_sigma=0.0)
@@ -41,11 +33,25 @@ SPREADS: dict[str, dict[str, float]] = {
     "sensor model": NO_POSES | NO_DISPARITY,
     "all": {},
 }
+SCORES = ("auc", "average_precision", "ece")
+
+
+def fused(frames: Frames, config: MapConfig) -> tuple[Plan, VoxelMap, float]:
+    """The plan, the map, and the median milliseconds of a step."""
+    plan = frames.plan(config)
+    prepared = [one for one in frames.prepared if one.frame is not None]
+    if plan.pose_errors is not None:
+        errors = jnp.asarray(plan.pose_errors)
+        prepared = [replace(one, frame=replace(one.frame, pose_errors=errors[one.index])) for one in prepared]
+    for one in prepared:
+        one.stages_s.pop("step", None)
+    voxel_map = fuse(plan, prepared)
+    return plan, voxel_map, 1e3 * float(np.median([one.stages_s["step"] for one in prepared]))
 
 
 def main() -> None:
     """Maps, scores, prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("traverses", nargs="+", help="sample:traverse, or folders that hold Part1 and gt")
     parser.add_argument("--members", type=int, default=8)
     parser.add_argument("--labels", choices=("deeplab", "plane"), default="deeplab")
@@ -54,89 +60,32 @@ def main() -> None:
         "--set", nargs=2, action="append", default=[], metavar=("OPTION", "VALUE"), help="of the ensemble"
     )
     parser.add_argument("--json", type=Path, help="file for the table")
-    given = parser.parse_args()
-    keep_compiled_programs()
+    given = parse(parser)
     options = EnsembleOptions(members=given.members, **{name: float(value) for name, value in given.set})
-    rows = [row for name in given.traverses for row in rows_of(name, given.labels, options, given.spreads)]
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=1) + "\n")
-
-
-def rows_of(name: str, labels: str, options: EnsembleOptions, spreads: list[str]) -> list[dict[str, Any]]:
-    """The table of one traverse, printed as it comes."""
-    sequence, truth = paths_of(name)
-    base = MapConfig(labeller=labels, depth=DepthConfig(max_m=RANGE_M))  # pyright: ignore[reportArgumentType]
-    plan = plan_run(sequence, base, lambda line: None)
-    frames = list(prepare_frames(plan.sequence, plan.front_end, needs=plan.labeller.needs))
-    alone = fused(plan, frames)
-    print(
-        f"\n{name}, labels by {labels}, {options.members} members; a step without them takes {alone['step_ms']:.0f} ms"
-    )
-    print(
-        f"{'spread':14s}{'AUC':>7s}{'AP':>7s}{'ECE':>8s}{'expected':>10s}{'missed':>8s}{'cells':>7s}"
-        f"{'ms per member':>15s}{'MiB per member':>16s}   said/true"
-    )
-    rows = []
-    for spread in spreads:
-        config = replace(base, ensemble=replace(options, **SPREADS[spread]))
-        plan = plan_run(sequence, config, lambda line: None)
-        run = fused(plan, frames)
-        scores = scored(plan, run["voxel_map"], truth)
-        row = {"traverse": name, "labels": labels, "spread": spread, "members": options.members} | scores
-        row["ms_per_member"] = (run["step_ms"] - alone["step_ms"]) / options.members
-        row["mib_per_member"] = run["voxel_map"].members.nbytes / options.members / 2**20
-        if not rows:
-            print_row("map alone", scores | scores["map_alone"], "")
-        print_row(spread, row, f"{row['ms_per_member']:15.0f}{row['mib_per_member']:16.1f}")
-        rows.append(row)
-    return rows
-
-
-def paths_of(name: str) -> tuple[str, Path]:
-    """Sequence and truth of a traverse."""
-    if name == "sample:traverse":
-        return name, bundled("traverse") / "gt" / "orthomosaic_labels.tif"
-    return str(Path(name) / "Part1"), Path(name) / "gt" / "orthomosaic_labels.tif"
-
-
-def fused(plan: Any, frames: list[PreparedFrame]) -> dict[str, Any]:
-    """The map of the frames, and the median time of a step."""
-    if plan.pose_errors is not None:
-        frames = [
-            replace(one, frame=replace(one.frame, pose_errors=jax.numpy.asarray(plan.pose_errors[one.index])))
-            for one in frames
-            if one.frame is not None
-        ]
-    for one in frames:
-        one.stages_s.pop("step", None)
-    started_s = time.perf_counter()
-    voxel_map, _ = deque(run_sequence(plan.mapper, plan.mapper.init(), frames, plan.params, plan.key), maxlen=1).pop()
-    steps_s = [one.stages_s["step"] for one in frames if "step" in one.stages_s]
-    total_s = time.perf_counter() - started_s
-    return {"voxel_map": voxel_map, "step_ms": 1e3 * float(np.median(steps_s)), "total_s": total_s}
-
-
-def scored(plan: Any, voxel_map: Any, truth: Path) -> dict[str, Any]:
-    """The scores of the ensemble."""
-    site_origin, crs = plan.sequence.site_origin, plan.sequence.crs
-    params, rule = plan.params.fusion, plan.rule
-    layers = ensemble_layers(voxel_map, params, rule)
-    class_map = class_map_of(voxel_map, params, rule, "rock", site_origin=site_origin, crs=crs)
-    class_map = replace(class_map, ensemble=np.asarray(layers.probability))
-    raster = read_truth([truth], class_map.place, TruthOptions())
-    return evaluate_map(class_map, raster, None, ScoringOptions(cell_size_m=CELL_M)).scores["ensemble"]
-
-
-def print_row(name: str, row: dict[str, Any], cost: str) -> None:
-    """One line of the table."""
-    numbers = f"{row['auc']:7.3f}{row['average_precision']:7.3f}{row['ece']:8.4f}"
-    counts = f"{row['expected_missed_cells']:10.1f}{row['missed_cells']:8d}{row['cells']:7d}"
-    bins = (
-        " ".join(f"{part['said']:.2f}/{part['true']:.2f}({part['cells']})" for part in row["reliability"])
-        if cost
-        else ""
-    )
-    print(f"{name:14s}{numbers}{counts if cost else '':25s}{cost:31s}   {bins}", flush=True)
+    columns = {"traverse": "<18", "spread": "<14", "AUC": "7.3f", "AP": "7.3f", "ECE": "8.4f", "expected": "10.1f"}
+    columns |= {"missed": "8d", "cells": "7d", "ms a step": "11.0f", "ms a member": "13.0f", "MiB a member": "14.1f"}
+    table = Table(columns)
+    for name in given.traverses:
+        traverse = Traverse(name)
+        frames, base = Frames(traverse.sequence), traverse.config(given.labels)
+        _, _, alone_ms = fused(frames, base)
+        for spread in given.spreads:
+            config = replace(base, ensemble=replace(options, **SPREADS[spread]))
+            plan, voxel_map, step_ms = fused(frames, config)
+            result = Scored(plan, voxel_map, traverse.truth)
+            layers = ensemble_layers(voxel_map, plan.params.fusion, plan.rule)
+            result.class_map = replace(result.class_map, ensemble=np.asarray(layers.probability))
+            scores = result.scores["ensemble"]
+            if spread == given.spreads[0]:
+                without = [scores["map_alone"][key] for key in SCORES]
+                table.row(traverse.name, "map alone", *without, None, None, None, alone_ms, None, None)
+            cells = (scores["expected_missed_cells"], scores["missed_cells"], scores["cells"])
+            member_ms = (step_ms - alone_ms) / given.members
+            member_mib = voxel_map.members.nbytes / given.members / 2**20
+            numbers = [scores[key] for key in SCORES]
+            more = {"labels": given.labels, "reliability": scores["reliability"]}
+            table.row(traverse.name, spread, *numbers, *cells, step_ms, member_ms, member_mib, **more)
+    table.write(given.json)
 
 
 if __name__ == "__main__":

@@ -1,67 +1,52 @@
-"""Trains on real images of Mars, from a pretrained backbone and from scratch, and prints both scores.
+"""Trains on recorded images of Mars, from a pretrained backbone and from scratch, and compares the scores.
 
-    python scripts/train_mars_rocks.py DATA BACKBONE --out DIR
+    python scripts/experiments/train_mars_rocks.py DATA BACKBONE --out DIR
 
 DATA is a folder of images and masks with train.txt and val.txt (MarsData's rocks), BACKBONE a checkpoint that
 `jaxmap weights import` reads. Both runs see the same crops in the same order, some twenty minutes each on two cores;
-interrupted ones go on where they stopped.
+interrupted ones are resumed. Prints one table: crops, time, and the IoU of rock of the last and of the best epoch.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
-from jaxmap.commands.main import main as jaxmap
-from jaxmap.host.memory import restart_with_lasting_memory
+from common import Table, command_line, jaxmap, parse
 
 RUNS = {
     "pretrained": [],
-    # What was never trained before has nothing to lose by moving fast.
+    # Fresh weights may move fast.
     "from scratch": ["--optimiser.backbone-rate", "1"],
 }
 
 
 def main() -> None:
-    """Runs both trainings and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Runs both trainings and prints the table."""
+    parser = command_line(__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("backbone", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", choices=list(RUNS))
-    arguments = parser.parse_args()
-
-    restart_with_lasting_memory()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    model = arguments.out / "backbone.safetensors"
-    run("weights", "import", str(arguments.backbone), "--out", str(model))
+    given = parse(parser)
+    given.out.mkdir(parents=True, exist_ok=True)
+    model = given.out / "backbone.safetensors"
+    jaxmap("weights", "import", given.backbone, "--out", model)
     for name, options in RUNS.items():
-        if arguments.only in (None, name):
-            start = ["--init", str(model)] if name == "pretrained" else []
-            out = arguments.out / name.replace(" ", "_")
-            train = ["train", str(arguments.data), "--out", str(out), "--config", "mars_rocks", *start, *options]
-            run(*train, *(["--resume"] if out.exists() else []))
-    print(f"\n{'start':<14}{'crops':>8}{'minutes':>9}{'crops/s':>9}{'rock IoU, last':>16}{'best':>8}{'at epoch':>10}")
+        if given.only in (None, name):
+            start = ["--init", model] if name == "pretrained" else []
+            out = given.out / name.replace(" ", "_")
+            resume = ["--resume"] if out.exists() else []
+            jaxmap("train", given.data, "--out", out, "--config", "mars_rocks", *start, *options, *resume)
+    columns = {"start": "<14", "crops": "8d", "minutes": "9.1f", "crops/s": "9.2f"}
+    table = Table({**columns, "rock IoU, last": "16.3f", "best": "8.3f", "at epoch": "10d"})
     for name in RUNS:
-        metrics = arguments.out / name.replace(" ", "_") / "metrics.json"
-        if metrics.exists():
-            print(row(name, json.loads(metrics.read_text())))
-
-
-def run(*words: str) -> None:
-    """Runs a command of jaxmap's; stops where it fails."""
-    if status := jaxmap(words):
-        raise SystemExit(status)
-
-
-def row(name: str, metrics: dict) -> str:
-    """One line of the table."""
-    crops, seconds, best = metrics["examples_seen"], metrics["seconds"], metrics["best"]
-    last, most = (scores["classes"]["rock"]["iou"] for scores in (metrics["last"], best))
-    return (
-        f"{name:<14}{crops:>8,}{seconds / 60:>9.1f}{crops / seconds:>9.2f}{last:>16.3f}{most:>8.3f}{best['epoch']:>10}"
-    )
+        path = given.out / name.replace(" ", "_") / "metrics.json"
+        if path.exists():
+            metrics = json.loads(path.read_text())
+            crops, seconds, best = metrics["examples_seen"], metrics["seconds"], metrics["best"]
+            ious = [scores["classes"]["rock"]["iou"] for scores in (metrics["last"], best)]
+            table.row(name, crops, seconds / 60, crops / seconds, *ious, best["epoch"])
 
 
 if __name__ == "__main__":
