@@ -3,10 +3,10 @@
     python scripts/experiments/ensemble.py TRAVERSE... [--members 8]   # sample:traverse, or folders with Part1 and gt
 
 Each traverse is mapped once without an ensemble and once for each spread: errors of the poses alone, of the disparities
-alone, of the sensor model alone, and all of them. Prints one table: how well the layer ranks the cells of 0.2 m that are
-rock among those that the map does not call rock (area under the ROC curve, average precision), its calibration error,
-how many it expects and how many there are, and the time and memory of a member. `map alone` ranks cells by the share of
-their columns that the map calls rock.
+alone, of the sensor model alone, and all of them. Prints one table: how well the layer ranks the cells of 0.2 m that
+are rock among those that the map does not call rock (area under the ROC curve, average precision), its calibration
+error, how many it expects and how many there are, and the time and memory of a member. `map alone` ranks cells by the
+share of their columns that the map calls rock.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 TRAVERSE is a folder in the simulator's layout. The bundled network is fine-tuned twice on the same frames, with the
 same recipe and as many steps: by the masks of these frames (pixels), and by the orthomosaic (map). Every network then
-maps the frames that it learnt from and those that were held out, at the end of the traverse. Prints one table: scores of
-rock in both maps, in cells of 0.2 m within 8 m, means over 16 lattices. An interrupted training is resumed.
+maps the frames that it learnt from and those that were held out, at the end of the traverse. Prints one table: scores
+of rock in both maps, in cells of 0.2 m within 8 m, means over 16 lattices. An interrupted training is resumed.
 """
 
 from __future__ import annotations

@@ -1,45 +1,40 @@
-"""Prints how well `jaxmap refine` finds back what was made wrong: poses of each frame, or the camera's mounting.
+"""How well `jaxmap refine` recovers geometry that was disturbed: poses of each frame, or the camera's mounting.
 
-    python scripts/refine_geometry.py SEQUENCE TRUE_POSES.tum [--dem F] [--truth LABELS.tif --labels DIR] [--seeds 0 1]
+    python scripts/experiments/refine_geometry.py SEQUENCE TRUE_POSES.tum [--dem F] [--truth LABELS.tif --labels DIR]
 
-True poses are made wrong by 0.2 m and 1 degree in random directions, frame by frame, or all by 2 degrees of pitch and
+True poses are disturbed by 0.2 m and 1 degree in random directions, frame by frame, or all by 2 degrees of pitch and
 0.1 m of height in the camera's mounting; then they are refined, from the images alone and with what is known of the
-ground, and compared with the true ones. Errors are of all poses as they lie in the world, and once more after the path
-as a whole was shifted and turned about the vertical to the true one: what is left then is what bends the map. Last come
-the poses that the reader itself estimates, if it does. With --labels and --truth, maps with all these poses are scored:
-IoU of rock in cells of 0.2 m within 8 m of the camera.
+ground. Last come the poses that the reader itself estimates, if it does. Prints one table: root mean square and
+greatest error of position and attitude, in the world, and once more after the path as a whole was shifted and turned
+about the vertical to the true one (what is left then is what bends the map); the pitch and height of the mounting; with
+--labels and --truth the IoU of rock of the map, in cells of 0.2 m within 8 m; seconds, and the spread of heights.
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
-from collections import deque
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+from common import RANGE_M, Frames, Table, command_line, parse
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions
 from jaxmap.datasets.pose_files import write_tum
 from jaxmap.errors import JaxmapError
-from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
 from jaxmap.geometry.bounds import usable_depth
-from jaxmap.host.cache import keep_compiled_programs
-from jaxmap.mapping.sequence import prepare_frames, run_sequence
 from jaxmap.refinement.rig import vehicle_axes
-from jaxmap.refinement.rounds import Ground, Refinement, refine
+from jaxmap.refinement.rounds import Ground, refine
 from jaxmap.refinement.solve import Prior
 from jaxmap.refinement.views import pinhole
 from jaxmap.runs.config import DepthConfig, MapConfig
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
-from jaxmap.runs.mapping_plan import plan_run
 from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, ground_of, read_inputs
 
 POSITION_M, ANGLE_RAD = 0.2, np.radians(1.0)
 PITCH_RAD, HEIGHT_M = np.radians(2.0), 0.1
+CASES = ("poses", "mounting", "own")
 
 
 def disturbed(T: np.ndarray, seed: int) -> np.ndarray:
@@ -73,107 +68,40 @@ def aligned(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
     return G @ T
 
 
-def errors(T: np.ndarray, T_true: np.ndarray) -> str:
-    """Root mean square and greatest error of position (cm) and attitude (deg); in the world, and aligned."""
-    texts = []
+def errors(T: np.ndarray, T_true: np.ndarray) -> list[float]:
+    """Root mean square and greatest error of position (cm) and attitude (deg), in the world and aligned.
+
+    Then pitch (deg) and height (cm) of the mounting, in the mean over the frames.
+    """
+    numbers = []
     for poses in (T, aligned(T, T_true)):
         off_cm = 100 * np.linalg.norm(poses[:, :3, 3] - T_true[:, :3, 3], axis=1)
         turn = Rotation.from_matrix(T_true[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, :3]).magnitude()
-        turn = np.degrees(turn)
-        texts.append(
-            f"{np.sqrt((off_cm**2).mean()):7.2f}{off_cm.max():7.2f}{np.sqrt((turn**2).mean()):8.3f}{turn.max():7.3f}"
-        )
-    return "  |".join(texts)
+        for values in (off_cm, np.degrees(turn)):
+            numbers += [float(np.sqrt((values**2).mean())), float(values.max())]
+    left, R = np.linalg.inv(T_true) @ T, vehicle_axes(T_true).R_vehicle_camera
+    pitch = (R @ np.degrees(Rotation.from_matrix(left[:, :3, :3]).as_rotvec()).mean(axis=0))[1]
+    return [*numbers, float(pitch), float((R @ (100 * left[:, :3, 3].mean(axis=0)))[2])]
 
 
-def mounting_errors(T: np.ndarray, T_true: np.ndarray) -> str:
-    """What is left of roll, pitch, heading (deg) and forward, left, up (cm), in the mean over the frames."""
-    left = np.linalg.inv(T_true) @ T
-    R = vehicle_axes(T_true).R_vehicle_camera
-    turn = R @ np.degrees(Rotation.from_matrix(left[:, :3, :3]).as_rotvec()).mean(axis=0)
-    way = R @ (100 * left[:, :3, 3].mean(axis=0))
-    return f"roll {turn[0]:.3f} pitch {turn[1]:.3f} heading {turn[2]:.3f} deg; height {way[2]:.2f} cm"
+def rock_iou(T_rectified: np.ndarray, given: Namespace, inputs: RefineInputs) -> float | None:
+    """IoU of rock of the map by the given labels and these poses of the rectified camera; None without labels."""
+    if given.labels is None or given.truth is None:
+        return None
+    T = T_rectified @ np.linalg.inv(inputs.front_end.T_raw_rectified)
+    T[:, :3, 3] += inputs.sequence.site_origin
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.tum"
+        write_tum(path, np.array([frame.timestamp_s for frame in inputs.sequence.frames]), T)
+        labels = {"labeller": "files", "labels": given.labels, "labels_are": given.labels_are}
+        depth = DepthConfig(max_m=RANGE_M)
+        config = MapConfig(**labels, poses=path, crs=given.crs, depth=depth, max_pose_gap_s=10.0)
+        return Frames(given.sequence, given.truth).scored(config).scores["iou"] or 0.0
 
 
-def refined(inputs: RefineInputs, T: np.ndarray, prior: Prior, ground: Ground) -> tuple[Refinement, float]:
-    """Refines poses of the rectified camera; and the seconds that took."""
-    camera = inputs.front_end.camera
-    depth_range_m = (0.3, usable_depth(camera, DEPTH_SIGMA_M, 0.5))
-    started_s = time.perf_counter()
-    return refine(inputs.views, T, pinhole(camera), prior, ground, depth_range_m), time.perf_counter() - started_s
-
-
-class Scorer:
-    """Scores the map that some poses give."""
-
-    def __init__(self, given: argparse.Namespace, inputs: RefineInputs) -> None:
-        self._given, self._inputs = given, inputs
-
-    def __call__(self, T_rectified: np.ndarray) -> str:
-        """IoU of rock with the given labels; empty without labels."""
-        given, sequence = self._given, self._inputs.sequence
-        if given.labels is None or given.truth is None:
-            return ""
-        T = T_rectified @ np.linalg.inv(self._inputs.front_end.T_raw_rectified)
-        T[:, :3, 3] += sequence.site_origin
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "poses.tum"
-            write_tum(path, np.array([frame.timestamp_s for frame in sequence.frames]), T)
-            config = MapConfig(
-                labeller="files", labels=given.labels, labels_are=given.labels_are, poses=path, crs=given.crs,
-                depth=DepthConfig(max_m=8.0), max_pose_gap_s=10.0,
-            )  # fmt: skip
-            plan = plan_run(given.sequence, config, lambda line: None)
-        frames = prepare_frames(plan.sequence, plan.front_end, plan.label_folder)
-        steps = run_sequence(plan.mapper, plan.mapper.init(), frames, plan.params, plan.key)
-        voxel_map, _ = deque(steps, maxlen=1).pop()
-        where = {"site_origin": plan.sequence.site_origin, "crs": plan.sequence.crs}
-        class_map = class_map_of(voxel_map, plan.params.fusion, plan.rule, "rock", **where)
-        raster = read_truth([given.truth], class_map.place, TruthOptions())
-        scores = evaluate_map(class_map, raster, None, ScoringOptions(cell_size_m=0.2)).scores
-        return f"   map: rock IoU {scores['iou'] or 0.0:.3f}"
-
-
-def grounds(given: argparse.Namespace, inputs: RefineInputs) -> dict[str, Ground]:
-    """What refinement is told of the ground: nothing, labels, an elevation model."""
-    depth_m = usable_depth(inputs.front_end.camera, DEPTH_SIGMA_M, 0.5)
-    found = {"images alone": Ground()}
-    if given.truth:
-        found["with labelled rocks"] = ground_of(GroundFiles(truth=(given.truth,)), inputs, depth_m)[0]
-    if given.dem:
-        found["with elevation model"] = ground_of(GroundFiles(heights=given.dem), inputs, depth_m)[0]
-    return found
-
-
-def run_case(
-    name: str,
-    T: np.ndarray,
-    T_true: np.ndarray,
-    inputs: RefineInputs,
-    prior: Prior,
-    told: dict[str, Ground],
-    score: Scorer,
-) -> None:
-    """Refines wrong poses with each kind of ground, and prints what is left."""
-    print(f"\n{name}\n  {'as given':24s}{errors(T, T_true)}{score(T)}")
-    if prior.mounting_rad:
-        print(f"  {'':24s}{mounting_errors(T, T_true)}")
-    for kind, ground in told.items():
-        state, seconds = refined(inputs, T, prior, ground)
-        found = state.rig.T_world_camera
-        assert state.solution is not None and state.before is not None and state.after is not None
-        print(
-            f"  {kind:24s}{errors(found, T_true)}{score(found)}   {seconds:.0f} s, spread of heights "
-            f"{100 * state.before.height_m:.2f} -> {100 * state.after.height_m:.2f} cm",
-            flush=True,
-        )
-        if prior.mounting_rad:
-            print(f"  {'':24s}{mounting_errors(found, T_true)}")
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    """Prints the table."""
+    parser = command_line(__doc__)
     parser.add_argument("sequence")
     parser.add_argument("true_poses", type=Path)
     parser.add_argument("--dem", type=Path)
@@ -182,33 +110,51 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--labels-are", default="raw", choices=("raw", "rectified"))
     parser.add_argument("--crs")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--cases", nargs="+", default=["poses", "mounting", "own"])
-    given = parser.parse_args(words)
-    keep_compiled_programs()
+    parser.add_argument(
+        "--cases", nargs="+", choices=("poses", "mounting", "own"), default=["poses", "mounting", "own"]
+    )
+    given = parse(parser)
     inputs = read_inputs(given.sequence, ReadOptions(poses=given.true_poses, max_pose_gap_s=10.0, crs=given.crs))
-    T_true, told, score = inputs.T_world_camera, grounds(given, inputs), Scorer(given, inputs)
-    print(f"{given.sequence}: {len(T_true)} frames")
-    print(f"{'':26s}{'position, cm':>14s}{'angle, deg':>15s}  |{'aligned: cm':>14s}{'deg':>15s}   (rms, greatest)")
-    print(f"  {'true':24s}{errors(T_true, T_true)}{score(T_true)}")
+    T_true, camera = inputs.T_world_camera, inputs.front_end.camera
+    depth_m = usable_depth(camera, DEPTH_SIGMA_M, 0.5)
+    grounds = {"images alone": Ground()}
+    if given.truth:
+        grounds["with labelled rocks"] = ground_of(GroundFiles(truth=(given.truth,)), inputs, depth_m)[0]
+    if given.dem:
+        grounds["with elevation model"] = ground_of(GroundFiles(heights=given.dem), inputs, depth_m)[0]
+    columns = {"what was wrong": "<20", "poses": "<22"}
+    for where in ("", "aligned "):
+        columns |= {f"{where}cm": "12.2f", f"{where}max": "12.2f", f"{where}deg": "12.3f", f"{where}max.": "13.3f"}
+    columns |= {"pitch, deg": "12.3f", "height, cm": "12.2f", "rock IoU": "10.3f"}
+    table = Table({**columns, "s": "6.0f", "heights, cm": "13.2f", "before": "8.2f"})
+
+    def run_case(name: str, T: np.ndarray, prior: Prior) -> None:
+        table.row(name, "as given", *errors(T, T_true), rock_iou(T, given, inputs), None, None, None)
+        for kind, ground in grounds.items():
+            started_s = time.perf_counter()
+            state = refine(inputs.views, T, pinhole(camera), prior, ground, (0.3, depth_m))
+            seconds, found = time.perf_counter() - started_s, state.rig.T_world_camera
+            assert state.before is not None and state.after is not None
+            spread = (100 * state.after.height_m, 100 * state.before.height_m)
+            table.row(name, kind, *errors(found, T_true), rock_iou(found, given, inputs), seconds, *spread)
+
+    table.row("nothing", "true", *errors(T_true, T_true), rock_iou(T_true, given, inputs), None, None, None)
     for seed in given.seeds:
         if "poses" in given.cases:
-            prior = Prior()
-            run_case(f"poses wrong, seed {seed}", disturbed(T_true, seed), T_true, inputs, prior, told, score)
+            run_case(f"poses, seed {seed}", disturbed(T_true, seed), Prior())
         if "mounting" in given.cases:
             prior = Prior(mounting_m=0.1, mounting_rad=np.radians(2.0))
-            run_case(f"mounting wrong, seed {seed}", mounted_wrong(T_true, seed), T_true, inputs, prior, told, score)
+            run_case(f"mounting, seed {seed}", mounted_wrong(T_true, seed), prior)
     if "own" in given.cases:
         try:
             own = read_inputs(given.sequence, ReadOptions(crs=given.crs))
         except JaxmapError as error:
-            print(f"\nno poses of its own: {error}")
+            print(f"no poses of its own: {error}")
             return
         own_T = own.T_world_camera.copy()
         own_T[:, :3, 3] += own.sequence.site_origin - inputs.sequence.site_origin
-        names = [frame.name for frame in own.sequence.frames]
-        kept = [index for index, frame in enumerate(inputs.sequence.frames) if frame.name in names]
-        if len(kept) == len(T_true) == len(names):
-            run_case("poses as the reader estimates them", own_T, T_true, inputs, Prior(), told, score)
+        if [frame.name for frame in own.sequence.frames] == [frame.name for frame in inputs.sequence.frames]:
+            run_case("the reader's own", own_T, Prior())
 
 
 if __name__ == "__main__":
