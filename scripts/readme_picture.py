@@ -1,10 +1,13 @@
 """Makes docs/motorcycle.png, the first picture of the README: the Motorcycle pair and its map in 3D.
 
-python scripts/readme_picture.py      (needs Chromium)
+    python scripts/readme_picture.py
+
+Needs Chromium; prints where the picture was written.
 """
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import subprocess
 import sys
@@ -26,7 +29,8 @@ STYLE = "<style>main{padding:1rem} h2,.view3d+p{display:none} .view3d{margin-top
 
 
 def main() -> int:
-    """Maps the pair, opens the map in a browser, and keeps what it shows."""
+    """Maps the pair, opens the map in a browser, and writes a screenshot."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         print("error: there is no Chromium; install it to make the picture", file=sys.stderr)

@@ -30,10 +30,7 @@ from harness import Group, bound, limit_threads, measure, usable_cores
 
 BASELINE = Path(__file__).with_name("baseline.json")
 SIZES = ("small", "medium", "large")
-LIBRARIES = (
-    *("jax", "numpy", "opencv-python-headless", "scikit-image"),
-    *("octomap-python", "open3d", "torch", "onnxruntime", "openvino"),
-)
+LIBRARIES = ["jax", "numpy", "opencv-python-headless", "octomap-python", "open3d", "torch", "onnxruntime", "openvino"]
 WIDTH = 40
 HEADER = f"{'':23s} {'times in ms':{WIDTH}s} {'median':>9s} {'spread':>9s} {'ratio':>8s} {'target':>7s} {'gate':>7s}"
 

@@ -94,12 +94,12 @@ def mlesac(size: str) -> Case:
     prepared = ours.fit_plane(points, hypotheses)
     fits = {"jaxmap": peers.PlaneFit(prepared.run)}
 
-    def peer(name: str, make: Callable[[], peers.PlaneFit], limit: float | None = None, module: str = "open3d") -> Peer:
+    def peer(name: str, make: Callable[[], peers.PlaneFit], limit: float | None = None) -> Peer:
         def kept() -> Run:
             fits[name] = make()
             return fits[name]
 
-        return Peer(name, kept, limit, size == "medium", modules=(module,))
+        return Peer(name, kept, limit, size == "medium", modules=("open3d",))
 
     def facts() -> Mapping[str, float]:
         errors = {
@@ -113,9 +113,6 @@ def mlesac(size: str) -> Case:
     if size != "large":
         name = f"Open3D segment_plane, {hypotheses} iterations"
         beside.insert(0, peer(name, lambda: peers.open3d_plane(points, hypotheses, 1.0), 1 / 20))
-    if size == "small":
-        name = f"scikit-image ransac, {hypotheses} trials"
-        beside.append(peer(name, lambda: peers.skimage_plane(points, hypotheses), module="skimage"))
     amount = Amount(hypotheses, "hypotheses")
     return Case(fits["jaxmap"], amount, amount, beside, prepared.compile_s, prepared.temporary_bytes, facts)
 

@@ -2,11 +2,11 @@
 
     python scripts/benchmarks/endurance.py [--frames 10000] [--every 1000] [--size 160 120] [--json F]
 
-A few rendered views of a slope lie on disk as PNG and are looped through as one long drive of a camera that goes round
-and round: they are decoded, matched and fused as `jaxmap map` does it, its log and its checkpoints included. Prints one
-table, a line every so many frames: frames a second, resident memory, the greatest number of frames alive at once, and
-how long the step waited although a frame was ready (from when both the step before was done and its frame was ready to
-when the step began); then the slope of the memory over the second half.
+A few images lie on disk as PNG and are looped through as one long drive: they are decoded, matched and fused as `jaxmap
+map` does it, its log and its checkpoints included. Prints one table, a line every so many frames: frames a second,
+resident memory, the greatest number of frames alive at once, and how long the step waited although a frame was ready
+(from when both the step before was done and its frame was ready to when the step began); then the slope of the memory
+over the second half.
 """
 
 from __future__ import annotations
@@ -24,11 +24,9 @@ from typing import Any
 
 import jax
 import numpy as np
-import yaml
-from PIL import Image
+from scene import resized_scene, write_sequence
 
 from jaxmap.datasets.base import FrameRef, StereoPair
-from jaxmap.datasets.pose_files import write_tum
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.mapping.sequence import FusedFrame
 from jaxmap.runs.config import check_config
@@ -40,28 +38,6 @@ from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
 VIEWS = 12
 STALL_MS = 5.0
 """From here on a wait counts as a stall; the matcher's threads share the processors with the thread that is woken."""
-
-
-def write_views(folder: Path, width_px: int, height_px: int) -> None:
-    """A folder sequence: random texture on a slope, whose disparity grows from 4 px above to 20 px below."""
-    rng = np.random.default_rng(0)
-    disparity_px = np.linspace(4, 20, height_px).astype(int)
-    poses = np.repeat(np.eye(4)[None], VIEWS, axis=0)
-    for part in ("left", "right"):
-        (folder / part).mkdir(parents=True)
-    for index in range(VIEWS):
-        right = rng.integers(0, 255, (height_px, width_px + 32), np.uint8)
-        left = np.stack([np.roll(row, shift) for row, shift in zip(right, disparity_px, strict=True)])
-        for part, image in (("left", left), ("right", right)):
-            Image.fromarray(image[:, 32:]).save(folder / part / f"{index:03d}.png")
-        turn = 2 * np.pi * index / VIEWS
-        poses[index, :3, :3] = [[1, 0, 0], [0, -np.sin(0.35), np.cos(0.35)], [0, -np.cos(0.35), -np.sin(0.35)]]
-        poses[index, :3, 3] = [np.cos(turn), np.sin(turn), 1.0]
-    camera = dict(fx_px=140.0, cx_px=width_px / 2, cy_px=height_px / 2, baseline_m=0.12)
-    (folder / "camera.yaml").write_text(yaml.safe_dump({"image_size_px": [width_px, height_px], **camera}))
-    times_s = 0.1 * np.arange(VIEWS)
-    (folder / "times.txt").write_text("".join(f"{time_s}\n" for time_s in times_s))
-    write_tum(folder / "poses.tum", times_s, poses)
 
 
 def looped(plan: Plan, frames: int) -> Plan:
@@ -140,10 +116,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     keep_compiled_programs()
-    with tempfile.TemporaryDirectory() as name:
-        write_views(Path(name, "views"), *given.size)
+    with write_sequence(resized_scene(*given.size), VIEWS) as views, tempfile.TemporaryDirectory() as name:
         config = check_config({"labeller": "plane", "depth": {"max_m": 5.0}, "grid": {"voxel_size_m": 0.2}})
-        plan = looped(plan_run(str(Path(name, "views")), config, str), given.frames)
+        plan = looped(plan_run(views, config, str), given.frames)
         watch, folder = Watch(plan, given.every), RunFolder(Path(name, "run"))
         folder.begin(plan, config, resume=False, overwrite=False)
         columns = ("frames", 8), ("frames/s", 14), ("resident, MiB", 15), ("most alive", 12), ("median wait, ms", 17)

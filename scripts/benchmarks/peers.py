@@ -102,37 +102,6 @@ def open3d_plane(points: np.ndarray, iterations: int, probability: float) -> Pla
     return PlaneFit(lambda: cloud.segment_plane(SIGMA_M, 3, iterations, probability)[0])
 
 
-class _PlaneModel:
-    """A plane as `skimage.measure.ransac` takes models: since 0.26 by `from_estimate`, before by `estimate`."""
-
-    @classmethod
-    def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
-        model = cls()
-        model.estimate(points)
-        return model
-
-    def estimate(self, points: np.ndarray) -> bool:
-        self.centre = points.mean(axis=0)
-        self.normal = np.linalg.svd(points - self.centre, full_matrices=False)[2][-1]
-        return True
-
-    def residuals(self, points: np.ndarray) -> np.ndarray:
-        return np.abs((points - self.centre) @ self.normal)
-
-
-def skimage_plane(points: np.ndarray, trials: int) -> PlaneFit:
-    """scikit-image's `ransac` with a plane, all trials made."""
-    from skimage.measure import ransac
-
-    random = np.random.default_rng(0)
-
-    def fit() -> np.ndarray:
-        model, _ = ransac(points, _PlaneModel, 3, SIGMA_M, max_trials=trials, stop_probability=1.0, rng=random)
-        return np.append(model.normal, -model.normal @ model.centre)
-
-    return PlaneFit(fit)
-
-
 def float_maps(scene: Scene, rig: StereoRig) -> Run:
     """OpenCV's rectification of both images with maps of floats."""
     size = (rig.width_px, rig.height_px)

@@ -65,7 +65,11 @@ class Scene:
 @cache
 def make_scene(size: str = "medium") -> Scene:
     """The pair with images of that size."""
-    width_px, height_px = IMAGE_PX[size]
+    return resized_scene(*IMAGE_PX[size])
+
+
+def resized_scene(width_px: int, height_px: int) -> Scene:
+    """The pair with images of any size."""
     sequence = open_sequence("sample:motorcycle")
     source = sequence.camera
     assert isinstance(source, StereoCamera)
