@@ -105,8 +105,8 @@ def run_cases(
 
 def print_case(name: str, case: dict[str, Any], baseline: dict[str, Any]) -> Iterator[str]:
     """Prints the lines of a case; yields those of its ratios that fail their gates."""
-    work, grown = case["work"], case["grown"]
-    notes = [f"{grown['count']:,.0f} {grown['unit']}", f"{case['work_per_s']:,.0f} {work['unit']}/s"]
+    work, grown, rate = case["work"], case["grown"], case["work_per_s"]
+    notes = [f"{grown['count']:,.0f} {grown['unit']}", f"{rate:{',.0f' if rate >= 100 else '.3g'}} {work['unit']}/s"]
     notes += [f"compiled in {case['compile_s']:.2f} s"] if "compile_s" in case else []
     notes += [f"{case['temporary_mib']:.1f} MiB temporary"] if "temporary_mib" in case else []
     print(f"{name:23s} {'jaxmap':{WIDTH}s} {_times(case)} {'':24s}  {'; '.join(notes)}", flush=True)

@@ -41,6 +41,9 @@ def random_network(backbone: str, stride: int) -> Any:
             tensor.uniform_(0.5, 0.9)
         elif tensor.ndim == 4:
             tensor.normal_(0, float(np.sqrt(2 / tensor[0].numel())))
+        if name == "segmentation_head.0.weight":
+            # Features are positive: without this one class would win everywhere.
+            tensor.sub_(tensor.mean(dim=1, keepdim=True)).mul_(4)
     return network
 
 
