@@ -1,10 +1,10 @@
-"""Makes what comes with jaxmap anew: the sample traverse and the network for rovers on sand.
+"""Makes again what is bundled with jaxmap: the sample traverse and the network for rovers on sand.
 
     python scripts/make_bundled.py --work DIR [--only model|traverse]
 
-Worlds are simulated (extra `sim`), their seeds below. Pictures of other worlds train the network, from scratch, by
+Worlds are simulated (extra `sim`), with the seeds below. Images of other worlds train the network from scratch, by
 `jaxmap train --config rover`; a traverse through a world that it never saw becomes the sample. Takes about two hours on
-two cores, and goes on where it was interrupted.
+two cores; an interrupted run is resumed.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ import numpy as np
 from PIL import Image
 
 BUNDLED = Path(__file__).resolve().parents[1] / "jaxmap" / "bundled"
-LESSONS = (
+TRAINING_SETS = (
     {"--training": "268", "--seed": "5001", "--size": "384 512"},
     {"--training": "200", "--seed": "5002", "--size": "576 768"},
 )
-"""Two sets of pictures; the larger ones show what the cameras of a rover see at their own size."""
+"""Two sets of images; the larger ones show what the cameras of a rover see at full size."""
 
-AGAIN = {"--norm.backbone": "batch", "--norm.head": "batch"}
+BY_BATCH = {"--norm.backbone": "batch", "--norm.head": "batch"}
 STAGES: dict[str, tuple[int, dict[str, str]]] = {
     "first": (1, {}),
-    "second": (1, AGAIN | {"--epochs": "36"}),
+    "second": (1, BY_BATCH | {"--epochs": "36"}),
     "third": (
         2,
-        AGAIN
+        BY_BATCH
         | {"--epochs": "24", "--augmentation.class-share": "0.6"}
         | {"--augmentation.crop-px": "320 448", "--augmentation.scale": "0.5 1.4"},
     ),
 }
-"""The network is trained, and again from there with the rate at its start: on how many of the sets, and how."""
+"""Stages of training, each from the network of the one before and with a fresh schedule: on how many sets, and how."""
 TRAVERSE = {"--scene": "few", "--seed": "101"}
 JPEG_QUALITY = 93
 """The sample's images are JPEG files in full colour resolution; as PNG files they would be five times as large."""
@@ -55,21 +55,21 @@ def main() -> None:
 
 
 def make_model(work: Path) -> None:
-    """Renders the lessons, trains on them, and copies the model."""
-    sets = [work / f"lessons_{lessons['--seed']}" for lessons in LESSONS]
-    for folder, lessons in zip(sets, LESSONS, strict=True):
-        jaxmap("simulate", "--out", folder, *words(lessons))
+    """Renders the training sets, trains on them, and copies the model."""
+    sets = [work / f"images_{options['--seed']}" for options in TRAINING_SETS]
+    for folder, options in zip(sets, TRAINING_SETS, strict=True):
+        jaxmap("simulate", "--out", folder, *words(options))
     start: list[str | Path] = []
     for name, (count, options) in STAGES.items():
-        run, lessons = work / name, joined(work / f"lessons_of_{name}", sets[:count])
+        run, images = work / name, joined(work / f"images_of_{name}", sets[:count])
         resume = ["--resume"] if run.exists() else []
-        jaxmap("train", lessons, "--out", run, "--config", "rover", *start, *words(options), *resume)
+        jaxmap("train", images, "--out", run, "--config", "rover", *start, *words(options), *resume)
         start = ["--init", run / "model.safetensors"]
     shutil.copyfile(start[1], BUNDLED / "rover.safetensors")
 
 
 def joined(folder: Path, sets: list[Path]) -> Path:
-    """A folder of the pictures of several sets, by links, with all their lists."""
+    """A folder of links to the images of several sets, with their lists joined."""
     for kind in ("images", "masks"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
         for path in (path for one in sets for path in sorted((one / kind).glob("*.png"))):
@@ -82,7 +82,7 @@ def joined(folder: Path, sets: list[Path]) -> Path:
 
 
 def make_traverse(work: Path) -> None:
-    """Renders the traverse, and keeps what the demo and its readers need."""
+    """Renders the traverse, and copies what the demo and the readers need."""
     source, target = work / "traverse", BUNDLED / "traverse"
     jaxmap("simulate", "--out", source, *words(TRAVERSE))
     shutil.rmtree(target, ignore_errors=True)
@@ -102,7 +102,7 @@ def make_traverse(work: Path) -> None:
 
 
 def copy_rasters(source: Path, target: Path) -> None:
-    """The labelled orthomosaic as it is; the picture with JPEG compression."""
+    """The labelled orthomosaic as it is; the orthomosaic with JPEG compression."""
     import rasterio
 
     shutil.copyfile(source / "orthomosaic_labels.tif", target / "orthomosaic_labels.tif")
@@ -121,7 +121,7 @@ def words(options: dict[str, str]) -> list[str]:
 
 
 def jaxmap(*command: str | Path) -> None:
-    """Runs a command of jaxmap's; stops where it fails."""
+    """Runs a command of jaxmap; stops where it fails."""
     if status := subprocess.run([sys.executable, "-m", "jaxmap", *map(str, command)]).returncode:
         raise SystemExit(status)
 

@@ -1,59 +1,64 @@
-"""What is timed of jaxmap: the one place where the benchmarks call its functions.
+"""What is timed of jaxmap: the one place where the benchmarks call its lower-level functions.
 
-Each function prepares one thing, compiles it and gives back how to run it.
+Each function prepares one thing, compiles it and returns how to run it.
 """
 
 from __future__ import annotations
 
 import copy
 import itertools
-import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from golden.seeded_weights import seeded_state_of
-from safetensors.numpy import save_file
+import optax
+from harness import timed
+from scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_poses
 
-from benchmarks.scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_poses
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
-from jaxmap.fusion.options import FusionRule
-from jaxmap.fusion.params import make_fusion_params
+from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.query import top_down
 from jaxmap.fusion.view import Reach, view_of
 from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
+from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.sequence import prepare_frames, run_sequence
 from jaxmap.mapping.step import Mapper, MapperParams, compile_step, make_mapper
+from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.importers import import_weights
+from jaxmap.models.deeplab import Weights, inference_network, initial_weights, training_form
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.match import StereoOptions
-from jaxmap.types import Frame, GridSpec, PointLabels, VoxelMap, make_voxel_map
+from jaxmap.stereo.options import StereoOptions
+from jaxmap.training.losses import total_loss
+from jaxmap.training.optimiser import is_statistic
+from jaxmap.training.options import LossOptions
+from jaxmap.tuning.pull_back import make_pull_back, map_gradient
+from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_grid, make_voxel_map
 
-BACKBONE = "mobilenet_v2"
 NETWORK_PX = (384, 512)
 """Height and width that the network sees."""
-UP = (0.0, 0.0, 1.0)
+KEY = jax.random.key(0)
 RULE = FusionRule()
 
 
 @dataclass
 class Prepared:
-    """Something compiled: how to run it, what compiling took, and the result of the last run."""
+    """Something compiled: how to run it, the time of compilation, its temporary memory, and the last result."""
 
     run: Callable[[], object]
     compile_s: float | None = None
@@ -64,17 +69,11 @@ class Prepared:
 def prepare(function: Callable[..., Any], *arguments: Any) -> Prepared:
     """Compiles a pure function for these arguments."""
     executable, compile_s, temporary_bytes = _compile(jax.jit(function).lower(*arguments))
-    prepared = Prepared(lambda: None, compile_s, temporary_bytes)
-
-    def run() -> None:
-        prepared.result = jax.block_until_ready(executable(*arguments))
-
-    prepared.run = run
-    return prepared
+    return Prepared(lambda: jax.block_until_ready(executable(*arguments)), compile_s, temporary_bytes)
 
 
-def prepare_update(function: Callable[..., Any], tensor: jax.Array, *arguments: Any) -> Prepared:
-    """Compiles an update of a tensor, which is donated; the runs go on with it, and it is their result."""
+def prepare_update(function: Callable[..., Any], tensor: Any, *arguments: Any) -> Prepared:
+    """Compiles an update of arrays, which are donated: each run updates the result of the one before."""
     executable, compile_s, temporary_bytes = _compile(jax.jit(function, donate_argnums=0).lower(tensor, *arguments))
     prepared = Prepared(lambda: None, compile_s, temporary_bytes, tensor)
 
@@ -88,13 +87,11 @@ def prepare_update(function: Callable[..., Any], tensor: jax.Array, *arguments: 
 def _compile(lowered: jax.stages.Lowered) -> tuple[jax.stages.Compiled, float, int]:
     started_s = time.perf_counter()
     executable = lowered.compile()
-    compile_s = time.perf_counter() - started_s
     memory = executable.memory_analysis()
-    return executable, compile_s, memory.temp_size_in_bytes if memory else 0
+    return executable, time.perf_counter() - started_s, memory.temp_size_in_bytes if memory else 0
 
 
-@dataclass(frozen=True)
-class Points:
+class Points(NamedTuple):
     """The points of a frame as fusion takes them."""
 
     points_world: jax.Array
@@ -124,21 +121,17 @@ def points_of(scene: Scene) -> Points:
     return Points(points_world, PointLabels(keep, labels=classes.astype(jnp.int32)), depth_m, valid)
 
 
-def fit_plane(points: np.ndarray, hypotheses: int) -> tuple[Callable[[], np.ndarray], Prepared]:
-    """MLESAC on a cloud, each fit with another key: a function that gives (4,) `normal . p + offset`; and its cost."""
+def fit_plane(points: np.ndarray, hypotheses: int) -> Prepared:
+    """MLESAC on a cloud, each run with another key; a run returns the plane (4,) `normal . p + offset = 0`."""
 
     def fit(key: jax.Array, points: jax.Array, valid: jax.Array) -> jax.Array:
-        plane = fit_plane_mlesac(key, points, valid, up_hint=jnp.array(UP), hypotheses=hypotheses)
+        plane = fit_plane_mlesac(key, points, valid, up_hint=jnp.array((0.0, 0.0, 1.0)), hypotheses=hypotheses)
         return jnp.append(plane.normal, plane.offset_m)
 
-    keys = itertools.cycle(list(jax.random.split(jax.random.key(0), 64)))
+    keys = itertools.cycle(list(jax.random.split(KEY, 64)))
     arguments = (jnp.asarray(points, jnp.float32), jnp.ones(len(points), bool))
     executable, compile_s, temporary_bytes = _compile(jax.jit(fit).lower(next(keys), *arguments))
-
-    def fitted() -> np.ndarray:
-        return np.asarray(executable(next(keys), *arguments))
-
-    return fitted, Prepared(fitted, compile_s, temporary_bytes)
+    return Prepared(lambda: np.asarray(executable(next(keys), *arguments)), compile_s, temporary_bytes)
 
 
 def window_of(scene: Scene, size: str) -> GridSpec:
@@ -159,44 +152,75 @@ def carve_frame(scene: Scene, window: GridSpec) -> Prepared:
 
 
 def integrate_frame(scene: Scene, grid: GridSpec) -> Prepared:
-    """The points of a frame into a map of their window, without carving."""
-    points, params = points_of(scene), make_fusion_params(ROVER_CLASSES)
-    empty = make_voxel_map(grid, ROVER_CLASSES)
-    rest, weights = replace(empty, log_odds=None), jnp.ones(scene.pixels)
+    """The points of one frame into a map of their window, without carving."""
+    params, empty = make_fusion_params(ROVER_CLASSES), make_voxel_map(grid, ROVER_CLASSES)
 
-    def add(log_odds: jax.Array, rest: VoxelMap, points_world: jax.Array, labels: PointLabels, weights: Any) -> Any:
+    def add(log_odds: jax.Array, rest: VoxelMap, points: Points, weights: jax.Array) -> jax.Array:
         voxel_map = replace(rest, log_odds=log_odds)
-        return integrate(voxel_map, points_world, labels, weights, params, RULE)[0].log_odds
+        return integrate(voxel_map, points.points_world, points.labels, weights, params, RULE)[0].log_odds
 
-    return prepare_update(add, empty.log_odds, rest, points.points_world, points.labels, weights)
+    rest = replace(empty, log_odds=None)
+    return prepare_update(add, empty.log_odds, rest, points_of(scene), jnp.ones(scene.pixels))
 
 
 def fuse_frame(scene: Scene, size: str) -> Prepared:
     """Carving and integration of one frame, as the step does them; the result is the map's tensor."""
-    points, params, grid = points_of(scene), make_fusion_params(ROVER_CLASSES), grid_of(size)
+    params, grid = make_fusion_params(ROVER_CLASSES), grid_of(size)
     empty = make_voxel_map(grid, ROVER_CLASSES)
     reach = Reach(DEPTH_RANGE_M, window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1)))
 
-    def fuse(log_odds: jax.Array, rest: VoxelMap, points: tuple[Any, ...], pose: jaxlie.SE3) -> jax.Array:
-        voxel_map, (points_world, labels, depth_m, valid) = replace(rest, log_odds=log_odds), points
-        view = view_of(grid, scene.camera, pose, depth_m, valid, params, RULE, reach)
-        fused, _ = integrate(
-            voxel_map, points_world, labels, view.weights, params, RULE, window=view.window, free=view.free
-        )
-        return fused.log_odds
+    def fuse(log_odds: jax.Array, rest: VoxelMap, points: Points, pose: jaxlie.SE3) -> jax.Array:
+        view = view_of(grid, scene.camera, pose, points.depth_m, points.valid, params, RULE, reach)
+        voxel_map, where = replace(rest, log_odds=log_odds), {"window": view.window, "free": view.free}
+        return integrate(voxel_map, points.points_world, points.labels, view.weights, params, RULE, **where)[0].log_odds
 
-    given = (points.points_world, points.labels, points.depth_m, points.valid)
-    return prepare_update(fuse, empty.log_odds, replace(empty, log_odds=None), given, scene.pose)
+    return prepare_update(fuse, empty.log_odds, replace(empty, log_odds=None), points_of(scene), scene.pose)
 
 
 @cache
-def network_model() -> SavedModel:
-    """DeepLabv3+ on MobileNetV2 as segmentation_models_pytorch builds it, with the weights that the peers have too."""
-    with tempfile.TemporaryDirectory() as folder:
-        save_file(seeded_state_of(BACKBONE), Path(folder) / "smp.safetensors")
-        imported = import_weights(Path(folder) / "smp.safetensors")
-    weights = {name: jnp.asarray(value) for name, value in imported.weights.items()}
-    return SavedModel(imported.architecture, weights, imported.holds)
+def network_model(backbone: str = "mobilenet_v2") -> SavedModel:
+    """DeepLabv3+ in the design of segmentation_models_pytorch, with initial weights."""
+    architecture = torch_architecture(backbone, ROVER_CLASSES)
+    return SavedModel(architecture, initial_weights(architecture, KEY), "network")
+
+
+def logits(backbone: str, images: np.ndarray) -> tuple[Prepared, float]:
+    """The network as `jaxmap segment` runs it on uint8 (B, H, W, 3), and the GFLOP that the compiler counts."""
+    model = network_model(backbone)
+    network = inference_network(model.architecture, model.weights)
+    executable, compile_s, temporary_bytes = _compile(jax.jit(network.apply).lower(network.weights, images))
+    prepared = Prepared(lambda: executable(network.weights, images).block_until_ready(), compile_s, temporary_bytes)
+    return prepared, executable.cost_analysis()["flops"] / 1e9
+
+
+def training_step(images: np.ndarray, labels: np.ndarray) -> Prepared:
+    """Forward, backward and AdamW on images uint8 (B, H, W, 3) and labels (B, H, W); batch norm by the batch."""
+    model = network_model()
+    # The peers are timed without dropout.
+    network = training_form(replace(model.architecture, dropout=0.0), ("backbone", "aspp", "decoder"))
+    optimiser = optax.adamw(1e-3, weight_decay=1e-4)
+
+    def loss(trained: Weights, fixed: Weights) -> tuple[jax.Array, Weights]:
+        logits, statistics = network({**trained, **fixed}, images, KEY)
+        return total_loss(logits, labels, jnp.ones(logits.shape[-1]), LossOptions()), statistics
+
+    def step(state: tuple[Weights, Weights, Any]) -> tuple[Weights, Weights, Any]:
+        trained, fixed, memory = state
+        gradient, statistics = jax.grad(loss, has_aux=True)(trained, fixed)
+        updates, memory = optimiser.update(gradient, memory, trained)
+        return optax.apply_updates(trained, updates), {**fixed, **statistics}, memory
+
+    trained = {name: jnp.array(value) for name, value in model.weights.items() if not is_statistic(name)}
+    fixed = {name: jnp.array(value) for name, value in model.weights.items() if is_statistic(name)}
+    return prepare_update(step, (trained, fixed, optimiser.init(trained)))
+
+
+def product_rate() -> float:
+    """GFLOP/s of a float32 product of matrices, the best of several: what this machine reaches."""
+    size = 1024
+    left = jnp.ones((size, size))
+    prepared = prepare(jnp.dot, left, left)
+    return 2e-9 * size**3 / min(timed(prepared.run) for _ in range(15))
 
 
 @cache
@@ -214,8 +238,7 @@ def label_pixels(scene: Scene, size_px: tuple[int, int]) -> Prepared:
     nowhere, valid = jnp.zeros((scene.pixels, 3)), jnp.ones(scene.pixels, bool)
 
     def probabilities(params: Any, frame: Frame) -> jax.Array | None:
-        labels, _ = labeller.label(frame, nowhere, valid, params, jax.random.key(0))
-        return labels.probabilities
+        return labeller.label(frame, nowhere, valid, params, KEY)[0].probabilities
 
     return prepare(probabilities, labeller.params, frame)
 
@@ -229,20 +252,20 @@ def mapper_of(scene: Scene, labeller: Labeller, size: str) -> tuple[Mapper, Mapp
 
 
 class Step:
-    """The compiled step on the scene's frame, into a map that it goes on filling."""
+    """The compiled step on the scene's frame; each call fuses it into the same map once more."""
 
     def __init__(self, scene: Scene, labeller: Labeller, size: str) -> None:
         """Compiles it."""
         self.mapper, self.params = mapper_of(scene, labeller, size)
-        self.key, self.voxel_map = jax.random.key(0), self.mapper.init()
+        self.voxel_map = self.mapper.init()
         image = jnp.asarray(scene.left) if labeller.needs == "image" else None
         self.frame = Frame(jnp.asarray(scene.disparity_px), scene.pose, image=image)
-        self.mapper, cost = compile_step(self.mapper, self.voxel_map, self.frame, self.params, self.key)
-        self.compile_s, self.temporary_bytes, self.scene = cost.compile_s, cost.temporary_bytes, scene
+        self.mapper, cost = compile_step(self.mapper, self.voxel_map, self.frame, self.params, KEY)
+        self.compile_s, self.temporary_bytes = cost.compile_s, cost.temporary_bytes
 
     def __call__(self) -> None:
         """Fuses the frame once more."""
-        self.voxel_map, _ = self.mapper.step(self.voxel_map, self.frame, self.params, self.key)
+        self.voxel_map, _ = self.mapper.step(self.voxel_map, self.frame, self.params, KEY)
         jax.block_until_ready(self.voxel_map.log_odds)
 
     def afresh(self) -> Step:
@@ -251,12 +274,11 @@ class Step:
         other.voxel_map = self.mapper.init()
         return other
 
-    def drive(self, frames: int) -> None:
-        """Fuses so many frames along a drive."""
-        for matrix in moved_poses(self.scene, frames):
-            pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, jnp.float32))
-            frame = replace(self.frame, T_world_camera=pose)
-            self.voxel_map, _ = self.mapper.step(self.voxel_map, frame, self.params, self.key)
+    def drive(self, poses: np.ndarray) -> None:
+        """Fuses the frame at each of these poses (N, 4, 4)."""
+        for matrix in poses:
+            frame = replace(self.frame, T_world_camera=jaxlie.SE3.from_matrix(jnp.asarray(matrix, jnp.float32)))
+            self.voxel_map, _ = self.mapper.step(self.voxel_map, frame, self.params, KEY)
         jax.block_until_ready(self.voxel_map.log_odds)
 
 
@@ -266,27 +288,47 @@ def map_sequence(scene: Scene, folder: Path, frames: int, size: str) -> Prepared
     labeller = labeller_of("deeplab")
     front_end = StereoFrontEnd(scene.camera, StereoOptions(num_disparities=DISPARITIES))
     mapper, params = mapper_of(scene, labeller, size)
-    key = jax.random.key(0)
-
     first = next(iter(prepare_frames(sequence, front_end, needs=labeller.needs)))
-    assert first.frame is not None
-    executable, compile_s, temporary_bytes = _compile(mapper.lower(mapper.init(), first.frame, params, key))
-    # `run_sequence` compiles with its first frame: here it gets the program ready made, so that runs time mapping.
-    mapper = mapper._replace(lower=lambda *arguments: _Ready(executable))
+    executable, compile_s, temporary_bytes = _compile(mapper.lower(mapper.init(), first.frame, params, KEY))
+    # `run_sequence` compiles with its first frame: here it gets the compiled program, so that runs time mapping alone.
+    mapper = mapper._replace(lower=lambda *arguments: SimpleNamespace(compile=lambda: executable))
 
     def run() -> None:
         frames = prepare_frames(sequence, front_end, needs=labeller.needs)
-        for voxel_map, _ in run_sequence(mapper, mapper.init(), frames, params, key):
+        for voxel_map, _ in run_sequence(mapper, mapper.init(), frames, params, KEY):
             jax.block_until_ready(voxel_map.log_odds)
 
     return Prepared(run, compile_s, temporary_bytes)
 
 
-@dataclass(frozen=True)
-class _Ready:
-    """A lowered program that was compiled before."""
+def _scored_mapper(camera: StereoCamera) -> tuple[Mapper, MapperParams]:
+    """A mapper of frames with soft labels into 8 x 12 x 1.4 m, and its parameters."""
+    grid = make_grid([-4, -1, -0.4], [4, 11, 1.0], (0.1, 0.1, 0.2))
+    mapper = make_mapper(camera, grid, make_files_labeller(ROVER_CLASSES, soft=True), RULE, (0.3, 6.0))
+    return mapper, MapperParams(camera, make_fusion_params(ROVER_CLASSES))
 
-    executable: jax.stages.Compiled
 
-    def compile(self) -> jax.stages.Compiled:
-        return self.executable
+def _rock_score(voxel_map: VoxelMap, params: MapperParams) -> jax.Array:
+    """The probability of rock, summed over the map's columns."""
+    top = top_down(voxel_map, params.fusion, RULE)
+    return jnp.where(top.observed, top.probability[ROVER_CLASSES.index("rock")], 0.0).sum()
+
+
+def gradient_by_pull_back(camera: StereoCamera, frames: Iterable[Frame]) -> tuple[Any, int]:
+    """The gradient of the map's score in all parameters, and the bytes of temporary memory that the compiler counts."""
+    mapper, params = _scored_mapper(camera)
+    functions = make_pull_back(mapper, _rock_score)
+    lowered = functions.lower(params, mapper.init().log_odds, next(iter(frames)), params, KEY, 0)
+    temporary_bytes = lowered.compile().memory_analysis().temp_size_in_bytes
+    return map_gradient(mapper, frames, params, KEY, _rock_score, pull_back=functions).gradient, temporary_bytes
+
+
+def gradient_by_scan(camera: StereoCamera, frames: Frame) -> tuple[Any, int]:
+    """The same by reverse mode through the scan; the frames lie in memory side by side."""
+    mapper, params = _scored_mapper(camera)
+
+    def loss(params: MapperParams, frames: Frame) -> jax.Array:
+        return _rock_score(mapper.scan(mapper.init(), frames, params, KEY)[0], params)
+
+    compiled = jax.jit(jax.grad(loss)).lower(params, frames).compile()
+    return compiled(params, frames), compiled.memory_analysis().temp_size_in_bytes

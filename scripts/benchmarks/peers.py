@@ -1,4 +1,4 @@
-"""The programs that people would use instead, each prepared on the same data; those of an extra are imported late."""
+"""The programs that people would use instead, each prepared on the same data; optional ones are imported when used."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+from harness import Peer, Run, usable_cores
 from numpy.typing import ArrayLike
+from scene import DISPARITIES, Scene
 
-from benchmarks.harness import Peer, Run
-from benchmarks.scene import DISPARITIES, Scene
-from benchmarks.threads import usable_cores
+from jaxmap.stereo.rectify import StereoRig
 
 SIGMA_M = 0.05
-"""Points as near to a plane are its inliers, for all."""
+"""Inliers of a plane lie within this distance, for all."""
 
 
 def sgbm(scene: Scene, calls: int = 1) -> Peer:
@@ -37,7 +37,7 @@ def sgbm(scene: Scene, calls: int = 1) -> Peer:
             speckleRange=2,
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
-        grey = scene.grey
+        grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
 
         def run() -> None:
             for _ in range(calls):
@@ -51,7 +51,7 @@ def sgbm(scene: Scene, calls: int = 1) -> Peer:
 def octomap_insertion(
     points_world: np.ndarray, origin_world: np.ndarray, resolution_m: float, *, discretize: bool, max_range_m: float
 ) -> Run:
-    """OctoMap's `insertPointCloud` into a tree that goes on being filled."""
+    """OctoMap's `insertPointCloud`; each run fills the same tree further."""
     import octomap
 
     tree = octomap.OcTree(resolution_m)
@@ -102,35 +102,18 @@ def open3d_plane(points: np.ndarray, iterations: int, probability: float) -> Pla
     return PlaneFit(lambda: cloud.segment_plane(SIGMA_M, 3, iterations, probability)[0])
 
 
-class _PlaneModel:
-    """A plane as `skimage.measure.ransac` takes models: since 0.26 by `from_estimate`, before by `estimate`."""
-
-    @classmethod
-    def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
-        model = cls()
-        model.estimate(points)
-        return model
-
-    def estimate(self, points: np.ndarray) -> bool:
-        self.centre = points.mean(axis=0)
-        self.normal = np.linalg.svd(points - self.centre, full_matrices=False)[2][-1]
-        return True
-
-    def residuals(self, points: np.ndarray) -> np.ndarray:
-        return np.abs((points - self.centre) @ self.normal)
-
-
-def skimage_plane(points: np.ndarray, trials: int) -> PlaneFit:
-    """scikit-image's `ransac` with a plane, all trials made."""
-    from skimage.measure import ransac
-
-    random = np.random.default_rng(0)
-
-    def fit() -> np.ndarray:
-        model, _ = ransac(points, _PlaneModel, 3, SIGMA_M, max_trials=trials, stop_probability=1.0, rng=random)
-        return np.append(model.normal, -model.normal @ model.centre)
-
-    return PlaneFit(fit)
+def float_maps(scene: Scene, rig: StereoRig) -> Run:
+    """OpenCV's rectification of both images with maps of floats."""
+    size = (rig.width_px, rig.height_px)
+    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+        *(rig.K_left, rig.distortion_left, rig.K_right, rig.distortion_right),
+        *(size, rig.R_right_left, rig.t_right_left_m.reshape(3, 1)),
+        alpha=0,
+    )
+    left = cv2.initUndistortRectifyMap(rig.K_left, rig.distortion_left, R_left, P_left, size, cv2.CV_32FC1)
+    right = cv2.initUndistortRectifyMap(rig.K_right, rig.distortion_right, R_right, P_right, size, cv2.CV_32FC1)
+    sides = ((scene.left, left), (scene.right, right))
+    return lambda: [cv2.remap(image, *maps, cv2.INTER_LINEAR) for image, maps in sides]
 
 
 def opencv_points(scene: Scene) -> Run:
@@ -151,28 +134,26 @@ def opencv_points(scene: Scene) -> Run:
     return lambda: cv2.transform(cv2.reprojectImageTo3D(disparity_px, Q), T)
 
 
-def memory_pass(
-    read: Sequence[np.ndarray], updated_floats: int, threads: int | None = None
-) -> Callable[[], list[tuple[int, np.ndarray]]]:
-    """Reads arrays and reads and writes so many float32, once, on all threads: no program that does so is faster.
+def memory_pass(read: Sequence[np.ndarray], updated_floats: int) -> Run:
+    """Reads arrays, and reads and writes so many float32, once, on all threads: no program that does so is faster.
 
     Args:
-        read: what is read; its greatest number is looked for, as that needs no more than reading.
+        read: arrays of which the greatest number is computed, which takes no longer than reading.
         updated_floats: numbers that are read and written.
-        threads: by default as many as the process may use.
 
     Returns:
-        What does so once; it gives for each thread the greatest number (of the bits of floats), and what it updated.
+        The run.
     """
-    threads = threads or usable_cores()
+    threads = usable_cores()
     flat = [array.reshape(-1).view(np.int32 if array.itemsize == 4 else np.int8) for array in read]
     target = np.zeros(updated_floats, np.float32)
     shares = [[part[index] for part in (np.array_split(array, threads) for array in flat)] for index in range(threads)]
     updated = np.array_split(target, threads)
     pool = ThreadPoolExecutor(threads)
 
-    def work(index: int) -> tuple[int, np.ndarray]:
-        greatest = max((int(part.max(initial=0)) for part in shares[index]), default=0)
-        return greatest, np.add(updated[index], 1.0, out=updated[index])
+    def work(index: int) -> None:
+        for part in shares[index]:
+            part.max(initial=0)
+        np.add(updated[index], 1.0, out=updated[index])
 
     return lambda: list(pool.map(work, range(threads)))

@@ -20,21 +20,18 @@ from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M
 from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.types import GridSpec, StereoCamera, make_grid, make_stereo_camera
 
-SIZES = ("small", "medium", "large")
 IMAGE_PX = {"small": (512, 384), "medium": (1024, 768), "large": (2048, 1536)}
 """Width and height; the LocCam's in the middle."""
 VOXEL_M = {"small": (0.4, 0.4, 0.4), "medium": (0.2, 0.2, 0.2), "large": DEFAULT_VOXELS_M[0]}
 """The paper's voxels in the middle, the default ones last."""
 DISPARITIES = 128
-"""That are searched where matching is timed, at all sizes."""
-LOWER_M, UPPER_M = (0.0, 0.0, -2.0), (40.0, 40.0, 2.0)
+"""Searched where matching is timed, at all sizes."""
 DEPTH_RANGE_M = (0.3, 12.0)
-FRAME_STEP_M, FRAME_STEP_S = 0.2, 0.1
 
 
 def grid_of(size: str) -> GridSpec:
     """40 x 40 x 4 m in voxels of that size."""
-    return make_grid(LOWER_M, UPPER_M, VOXEL_M[size])
+    return make_grid((0.0, 0.0, -2.0), (40.0, 40.0, 2.0), VOXEL_M[size])
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +49,13 @@ class Scene:
         return self.left.shape[0] * self.left.shape[1]
 
     @property
-    def grey(self) -> list[np.ndarray]:
-        """Both images in grey."""
-        return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (self.left, self.right)]
-
-    @property
     def pose(self) -> jaxlie.SE3:
         """`T_world_camera` as the step takes it."""
         return jaxlie.SE3.from_matrix(jnp.asarray(self.T_world_camera, jnp.float32))
 
     @cached_property
     def disparity_px(self) -> np.ndarray:
-        """Disparity by SGBM 3WAY, NaN where there is none; as many are searched as the size asks for."""
+        """Disparity by SGBM 3WAY, NaN where there is none; the search range grows with the size."""
         width_px = self.left.shape[1]
         return Matcher(StereoOptions(num_disparities=width_px // 8, pad_left=False), width_px)(self.left, self.right)
 
@@ -71,13 +63,17 @@ class Scene:
 @cache
 def make_scene(size: str = "medium") -> Scene:
     """The pair with images of that size."""
-    width_px, height_px = IMAGE_PX[size]
+    return resized_scene(*IMAGE_PX[size])
+
+
+def resized_scene(width_px: int, height_px: int) -> Scene:
+    """The pair with images of any size."""
     sequence = open_sequence("sample:motorcycle")
-    pair = sequence.read_pair(sequence.frames[0])
     source = sequence.camera
     assert isinstance(source, StereoCamera)
     zoom_x, zoom_y = width_px / source.width_px, height_px / source.height_px
     way = cv2.INTER_AREA if zoom_x < 1 else cv2.INTER_CUBIC
+    pair = sequence.read_pair(sequence.frames[0])
     left, right = (cv2.resize(image, (width_px, height_px), interpolation=way) for image in pair)
     camera = make_stereo_camera(
         fx_px=float(source.fx_px) * zoom_x,
@@ -97,7 +93,7 @@ def make_scene(size: str = "medium") -> Scene:
 def moved_poses(scene: Scene, frames: int) -> np.ndarray:
     """Poses of a drive that stays in the map, (N, 4, 4): ahead by 0.2 m a frame, over 20 m again and again."""
     poses = np.repeat(scene.T_world_camera[None], frames, axis=0)
-    poses[:, 1, 3] += FRAME_STEP_M * (np.arange(frames) % 100)
+    poses[:, 1, 3] += 0.2 * (np.arange(frames) % 100)
     return poses
 
 
@@ -110,10 +106,10 @@ def write_sequence(scene: Scene, frames: int) -> tempfile.TemporaryDirectory[str
         for index in range(frames):
             Image.fromarray(np.roll(image, index, axis=0)).save(folder / side / f"{index:06d}.png", compress_level=3)
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m", "doffs_px")
-    numbers = {key: float(getattr(scene.camera, key)) for key in names}
-    height_px, width_px = scene.left.shape[:2]
-    (folder / "camera.yaml").write_text(json.dumps({"image_size_px": [width_px, height_px], **numbers}))
-    times_s = FRAME_STEP_S * np.arange(frames)
+    camera = {key: float(getattr(scene.camera, key)) for key in names}
+    size_px = [scene.camera.width_px, scene.camera.height_px]
+    (folder / "camera.yaml").write_text(json.dumps({"image_size_px": size_px, **camera}))
+    times_s = 0.1 * np.arange(frames)
     (folder / "times.txt").write_text("\n".join(map(str, times_s)))
     write_tum(folder / "poses.tum", times_s, moved_poses(scene, frames))
     return owner

@@ -1,9 +1,8 @@
-"""Projective carving against ray casting: by a twin in NumPy, and by OctoMap where it is installed."""
+"""Projective carving against ray casting by a twin in NumPy."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -14,37 +13,15 @@ import reference
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 from reference_rays import cast_rays, walk
 from strategies import HEIGHT_PX, WIDTH_PX, cameras, rngs
 from test_carve import SHARP, see_through, views
-from truth_files import CRS, SITE, write_raster
 
-from jaxmap.fusion.options import FusionRule
-from jaxmap.fusion.params import make_fusion_params
+from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.geometry.camera import disparity_to_points, transform_points
 from jaxmap.labellers.base import make_no_labeller
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.types import Frame, GridSpec, make_grid, make_stereo_camera
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from agreement.causes import CAUSES, agreement_of, explain
-from agreement.heights import ABOVE, BELOW, NO_TRUTH, SURFACE, true_voxels
-from agreement.maps import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    Seen,
-    TwoMaps,
-    cloud_of,
-    in_range_only,
-    insert,
-    make_octree,
-    map_both,
-    map_classes,
-    octree_classes,
-)
-from agreement.picture import draw_agreement, from_above, kinds_of_voxels
 
 DEPTH_RANGE_M = (0.3, 5.0)
 FRAMES = 5
@@ -128,108 +105,34 @@ class Setting:
 
 
 @pytest.fixture(scope="module")
-def mapped() -> tuple[TwoMaps, Setting]:
-    """The scene by the compiled step, and by rays of the twin."""
+def mapped() -> tuple[np.ndarray, np.ndarray, Setting]:
+    """Evidence of occupancy of every voxel of the scene: by the compiled step, and by rays of the twin."""
     setting = Setting()
-    ours, seen = setting.mapper.init(), []
-    evidence = np.zeros(setting.grid.shape)
-    fusion = setting.params.fusion
+    camera, fusion = setting.params.camera, setting.params.fusion
+    voxel_map, by_rays = setting.mapper.init(), np.zeros(setting.grid.shape)
     for frame in setting.frames():
-        near = in_range_only(frame, setting.params.camera, DEPTH_RANGE_M)
-        ours, _ = setting.mapper.step(ours, near, setting.params, KEY)
-        alone, _ = setting.mapper.step(setting.mapper.init(), near, setting.params, KEY)
-        cloud = cloud_of(near, setting.params.camera)
-        cast = cast_rays(setting.grid, cloud.origin_world, cloud.points_world)
-        evidence += cast.hit * float(fusion.occupancy_hit) + cast.free * float(fusion.occupancy_miss)
-        theirs = cast.hit.astype(np.int8) - cast.free
-        seen.append(Seen(frame, np.sign(np.asarray(alone.log_odds[0])).astype(np.int8), theirs))
-    classes = np.where(evidence > 0, OCCUPIED, np.where(evidence < 0, FREE, UNKNOWN)).astype(np.int8)
-    return TwoMaps(map_classes(ours, fusion), classes, seen), setting
+        # Both get one cloud: carving would also see through what lies before points beyond the mapped depths.
+        points, valid = disparity_to_points(camera, frame.disparity_px)
+        kept = valid & (points[..., 2] >= DEPTH_RANGE_M[0]) & (points[..., 2] <= DEPTH_RANGE_M[1])
+        near = replace(frame, disparity_px=jnp.where(kept, frame.disparity_px, jnp.nan))
+        voxel_map, _ = setting.mapper.step(voxel_map, near, setting.params, KEY)
+        cloud = np.asarray(transform_points(frame.T_world_camera, points), np.float64)[np.asarray(kept)]
+        cast = cast_rays(setting.grid, np.asarray(frame.T_world_camera.translation(), np.float64), cloud)
+        by_rays += cast.hit * float(fusion.occupancy_hit) + cast.free * float(fusion.occupancy_miss)
+    return np.asarray(voxel_map.log_odds[0]), by_rays, setting
 
 
 def test_carving_and_casting_rays_agree_on_what_both_observed(mapped):
-    maps, _ = mapped
-    agreement = agreement_of(maps)
-    assert agreement.confusion[1, 1] > 3000 and agreement.confusion[2, 2] > 1000
-    assert agreement.both >= 0.97
+    ours, by_rays, _ = mapped
+    both = (ours != 0) & (by_rays != 0)
+    assert (both & (ours < 0)).sum() > 3000 and (both & (ours > 0)).sum() > 1000
+    assert (np.sign(ours[both]) == np.sign(by_rays[both])).mean() >= 0.97
     # What is seen through was crossed: carving frees nothing that rays do not.
-    assert not ((maps.ours == FREE) & (maps.theirs != FREE)).any()
+    assert not ((ours < 0) & (by_rays >= 0)).any()
 
 
 def test_what_is_carved_is_truly_free_more_often_than_what_rays_cross(mapped):
-    maps, setting = mapped
-    wrong_ours, wrong_rays = (setting.solid()[classes == FREE].mean() for classes in (maps.ours, maps.theirs))
+    ours, by_rays, setting = mapped
+    wrong_ours, wrong_rays = (setting.solid()[evidence < 0].mean() for evidence in (ours, by_rays))
     assert wrong_ours < 0.005
     assert wrong_ours < wrong_rays
-
-
-def test_every_difference_has_one_cause(mapped):
-    maps, setting = mapped
-    camera, fusion = setting.params.camera, setting.params.fusion
-    found = explain(maps, camera, setting.grid, fusion, DEPTH_RANGE_M)
-    conflicts, alone = found.counts(both=True), found.counts(both=False)
-    assert sum(conflicts.values()) + sum(alone.values()) == (maps.ours != maps.theirs).sum()
-    assert set(conflicts) == set(CAUSES)
-    # Rays are dense here, and only a point on a voxel's face may fall to either side.
-    assert conflicts["no_ray"] == alone["no_ray"] == 0
-    assert conflicts["rounding"] + alone["rounding"] <= 0.001 * (maps.theirs != 0).sum()
-    assert alone["behind"] > 0 and alone["noise"] > 0
-
-
-def test_the_picture_shows_each_class_and_each_cause_that_occurs(mapped, tmp_path):
-    maps, setting = mapped
-    found = explain(maps, setting.params.camera, setting.grid, setting.params.fusion, DEPTH_RANGE_M)
-    kinds = kinds_of_voxels(maps, found)
-    assert ((kinds == 0) == ((maps.ours == UNKNOWN) & (maps.theirs == UNKNOWN))).all()
-    assert (
-        (kinds == 3).sum()
-        == found.both.sum()
-        == agreement_of(maps).confusion[1:, 1:].sum() - (((kinds == 1) | (kinds == 2)).sum())
-    )
-    colours = from_above(kinds)
-    conflict = (kinds == 3).any(axis=2)
-    assert conflict.any() and len(np.unique(colours[conflict], axis=0)) == 1
-    assert not (colours[~conflict] == colours[conflict][0]).all(axis=-1).any()
-    draw_agreement(maps, found, setting.grid, "scene", tmp_path / "scene.png")
-    picture = np.asarray(Image.open(tmp_path / "scene.png").convert("RGB"))
-    assert picture.shape[0] > 900 and (picture == colours[conflict][0]).all(axis=-1).any()
-
-
-def test_voxels_are_told_apart_by_the_lowest_and_the_highest_ground_in_them(tmp_path):
-    # A step from 46.05 to 46.65 m in the middle of the second column from the west; the north-east is not known.
-    heights = np.full((4, 8), 46.05, np.float32)
-    heights[:, 3:] = 46.65
-    heights[:2, 6:] = np.nan
-    path = write_raster(tmp_path / "dem.tif", heights, SITE[0], SITE[1] + 0.4, 0.1)
-    grid = make_grid([0, 0, 0.8], [0.8, 0.4, 2.0], 0.2)
-    truth = true_voxels(path, grid, SITE, CRS)
-    assert truth.shape == (4, 2, 6)
-    low = [BELOW, SURFACE, ABOVE, ABOVE, ABOVE, ABOVE]
-    step = [BELOW, SURFACE, SURFACE, SURFACE, SURFACE, ABOVE]
-    high = [BELOW, BELOW, BELOW, BELOW, SURFACE, ABOVE]
-    for y in (0, 1):
-        np.testing.assert_array_equal(truth[:3, y], [low, step, high])
-    np.testing.assert_array_equal(truth[3], [high, [NO_TRUTH] * 6])
-
-
-def test_octomap_is_the_twin_and_agrees(mapped):
-    pytest.importorskip("octomap", reason="octomap-python is not installed (extra bench)")
-    twin, setting = mapped
-    maps = map_both(setting.frames(), setting.mapper, setting.params, setting.grid, DEPTH_RANGE_M)
-    np.testing.assert_array_equal(maps.ours, twin.ours)
-    # But for rays along a face and points on one.
-    assert (maps.theirs == twin.theirs).mean() > 0.999
-    assert agreement_of(maps).both >= 0.97
-
-
-def test_classes_of_an_octree_are_those_that_it_tells_of_each_voxel():
-    pytest.importorskip("octomap", reason="octomap-python is not installed (extra bench)")
-    setting = Setting()
-    tree = make_octree(setting.grid, setting.params.fusion)
-    frame = in_range_only(setting.frames()[0], setting.params.camera, DEPTH_RANGE_M)
-    insert(tree, cloud_of(frame, setting.params.camera))
-    told = tree.getLabels(reference.voxel_centres(setting.grid).reshape(-1, 3)).reshape(setting.grid.shape)
-    of_octomap = {-1: UNKNOWN, 0: FREE, 1: OCCUPIED}
-    assert set(np.unique(told)) == set(of_octomap)
-    for number, name in of_octomap.items():
-        np.testing.assert_array_equal(octree_classes(tree, setting.grid) == name, told == number)

@@ -1,4 +1,4 @@
-"""The geometric half on recorded data; scripts/accuracy.py prints the same figures in full."""
+"""The geometric half on recorded data; scripts/experiments/accuracy.py prints the same figures in full."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
 """How long jaxmap takes to start: its help, and the first mapped frame, with an empty cache and with a full one.
 
-    python scripts/startup.py [--sequence SEQUENCE] [--config NAME] [--labellers none plane deeplab] [--repeats 5]
+    python scripts/benchmarks/startup.py [--sequence SEQUENCE] [--config NAME] [--labellers none plane] [--repeats 5]
 
 Every figure is that of a process of its own, from its creation on, as wall time and as processor time: where others use
 the same cores the wall time grows, the other less so. Threads that read ahead count, too, as two frames and more are
 matched by the time the first one is mapped. The empty cache is a new folder for each labeller; the full one is the same
-folder from then on. `compiled` counts the programs that the cache did not hold.
+folder from then on. Prints one table: medians of the repeats, and how many programs the cache did not hold.
 """
 
 from __future__ import annotations
@@ -35,36 +35,33 @@ def age_s() -> float:
 
 
 def map_first_frame(words: list[str]) -> None:
-    """`jaxmap map`, which ends as soon as a frame is in the map, and tells how long that took."""
+    """`jaxmap map`, which ends as soon as a frame is in the map, and prints the time that took as JSON."""
     from jaxmap.commands import main as cli
     from jaxmap.commands import map as command
 
     class Stopwatch(command.Console):
-        """Hears of the first frame, and of programs that the cache did not hold."""
+        """A console whose progress bar ends the process at the first frame."""
 
         def __init__(self) -> None:
             import jax
 
             super().__init__()
-            self.missed: list[str] = []
-            jax.monitoring.register_event_listener(self.hear)
-
-        def hear(self, event: str, **_: object) -> None:
-            if event == "/jax/compilation_cache/cache_misses":
-                self.missed.append(event)
+            self.events: list[str] = []
+            jax.monitoring.register_event_listener(lambda event, **_: self.events.append(event))
 
         def progress(self, title: str, total: int) -> Any:
             import jax
 
             def first(fused: object) -> None:
-                figures = {"wall_s": age_s(), "processor_s": time.process_time(), "compiled": len(self.missed)}
+                missed = self.events.count("/jax/compilation_cache/cache_misses")
+                figures = {"wall_s": age_s(), "processor_s": time.process_time(), "compiled": missed}
                 print(json.dumps({**figures, "device": jax.devices()[0].device_kind}), flush=True)
                 os._exit(0)
 
             return nullcontext(first)
 
     command.Console = Stopwatch
-    # What the command line is told as its own: it may start this process again.
+    # The command may restart this process by its own words.
     sys.argv = ["jaxmap", *words]
     sys.exit(cli.main())
 
@@ -84,27 +81,11 @@ def in_process(words: list[str], cache: Path | None = None) -> tuple[str, dict[s
 
 
 def first_frame(sequence: str, config: str | None, labeller: str, cache: Path) -> dict[str, Any]:
-    """What the first frame of one run took."""
+    """Times of the first frame of one run."""
     with tempfile.TemporaryDirectory() as out:
         options = [*(["--config", config] if config else []), "--labeller", labeller, "--out", f"{out}/run"]
         printed, _ = in_process([__file__, "--first-frame", sequence, *options], cache)
     return json.loads(printed.splitlines()[-1])
-
-
-def median(figures: list[dict[str, Any]]) -> dict[str, Any]:
-    """The median of each number; of words, the last."""
-    return {
-        name: last if isinstance(last, str) else round(statistics.median(one[name] for one in figures), 3)
-        for name, last in figures[-1].items()
-    }
-
-
-def told(name: str, figures: dict[str, Any]) -> None:
-    """One line."""
-    compiled = f", {figures['compiled']:.0f} programs compiled" if "compiled" in figures else ""
-    print(
-        f"{name:34s} {figures['wall_s']:6.2f} s wall, {figures['processor_s']:6.2f} s processor{compiled}", flush=True
-    )
 
 
 def main() -> None:
@@ -117,17 +98,23 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     results: dict[str, dict[str, Any]] = {}
+
+    def record(name: str, figures: list[dict[str, Any]]) -> None:
+        median = {key: statistics.median(one[key] for one in figures) for key in figures[0] if key != "device"}
+        results[name] = {**figures[-1], **{key: round(value, 3) for key, value in median.items()}}
+        compiled = str(results[name].get("compiled", ""))
+        print(f"{name:36s}{median['wall_s']:9.2f}{median['processor_s']:14.2f}{compiled:>10s}", flush=True)
+
+    print(f"{'':36s}{'wall, s':>9s}{'processor, s':>14s}{'compiled':>10s}")
     for name, words in HELPS.items():
-        results[name] = median([in_process(["-m", "jaxmap", *words])[1] for _ in range(given.repeats)])
-        told(name, results[name])
+        record(name, [in_process(["-m", "jaxmap", *words])[1] for _ in range(given.repeats)])
     for labeller in given.labellers:
         with tempfile.TemporaryDirectory() as cache:
             task = (given.sequence, given.config, labeller, Path(cache))
-            results[f"{labeller}: empty cache"] = first_frame(*task)
-            results[f"{labeller}: full cache"] = median([first_frame(*task) for _ in range(given.repeats)])
-        for state in ("empty cache", "full cache"):
-            told(f"first frame, {labeller}, {state}", results[f"{labeller}: {state}"])
-    print(f"{results[f'{given.labellers[-1]}: full cache']['device']}, {os.cpu_count()} processors")
+            record(f"first frame, {labeller}, empty cache", [first_frame(*task)])
+            record(f"first frame, {labeller}, full cache", [first_frame(*task) for _ in range(given.repeats)])
+    device = next((one["device"] for one in results.values() if "device" in one), "no frame mapped")
+    print(f"{device}, {os.cpu_count()} processors")
     if given.json:
         given.json.write_text(json.dumps(results, indent=2) + "\n")
 

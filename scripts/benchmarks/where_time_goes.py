@@ -1,9 +1,10 @@
 """Where the time of the compiled step goes, stage by stage, against what memory and arithmetic of this machine reach.
 
-    python scripts/where_time_goes.py [SEQUENCE] [--config NAME] [--labeller plane] [--frames 13] [--json F]
+    python scripts/benchmarks/where_time_goes.py [SEQUENCE] [--config NAME] [--labeller plane] [--frames 4] [--json F]
 
 The frames are read and matched beforehand: while the steps are traced, nothing else runs in this process (`jaxmap map
---profile` tells the same of a whole run, with reading and matching beside it). docs/performance.md says how to read it.
+--profile` measures the same within a whole run, with reading and matching beside it). docs/performance.md explains the
+table.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=4, help="different frames, used in turn")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    # As the command does: a step whose memory comes fresh from the system at each frame is another one.
+    # As the command does: with memory that comes fresh from the system at each frame, a step takes longer.
     restart_with_lasting_memory()
     keep_compiled_programs(scopes=True)
     config = replace(
         load_config(given.config) if given.config else MapConfig(), labeller=given.labeller, stop=given.frames
     )
-    plan = plan_run(given.sequence, config, print)
+    plan = plan_run(given.sequence, config, str)
     prepared = list(prepare_frames(plan.sequence, plan.front_end, needs=plan.labeller.needs))
     frames = [one.frame for one in prepared if one.frame is not None]
     voxel_map = plan.mapper.init()
@@ -58,7 +59,7 @@ def main() -> None:
         summary = profile.summary(cost.program)
     step_ms = 1e3 * sorted(times_s[WARM_UP_FRAMES:])[TRACED_FRAMES // 2]
     assert summary is not None
-    print("\n".join([f"labeller {given.labeller}: a step takes {step_ms:.1f} ms, traced", *table_lines(summary)]))
+    print("\n".join([f"labeller {given.labeller}: a traced step takes {step_ms:.1f} ms", *table_lines(summary)]))
     if given.json:
         given.json.write_text(json.dumps({**summary, "step_ms": round(step_ms, 3)}, indent=2) + "\n")
 
