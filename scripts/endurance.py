@@ -182,7 +182,7 @@ def main() -> None:
         config = check_config({"labeller": "plane", "depth": {"max_m": 5.0}, "grid": {"voxel_size_m": 0.2}})
         plan = looped(plan_run(str(Path(name, "views")), config, print), given.frames)
         watch, folder = Watch(plan, given.every), RunFolder(Path(name, "run"))
-        folder.begin(plan, config, resume=False, overwrite=False)
+        folder.begin(plan.settings(config), resume=False, overwrite=False)
         options: dict[str, Any] = {"strict": True, "checkpoint_every_s": 30.0, "notify": print}
         metrics = run_plan(watch.plan, folder, on_frame=watch.on_frame, **options)
     figures = summary(watch, metrics, given.every)

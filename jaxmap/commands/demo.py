@@ -86,7 +86,7 @@ def _map_and_score(out: Path, config: MapConfig, truth: Path, console: Console) 
     folder = RunFolder(out)
     plan = plan_run(SAMPLE, config, console.notify)
     with folder.locked():
-        folder.begin(plan, config, resume=False, overwrite=True)
+        folder.begin(plan.settings(config), resume=False, overwrite=True)
         metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify)
     evaluation, class_map = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
     write_evaluation(folder.scores, folder.errors, evaluation, class_map, truth / "orthomosaic.tif")
