@@ -23,12 +23,13 @@ import numpy as np
 
 from jaxmap.ensemble.layer import ensemble_layers
 from jaxmap.ensemble.options import EnsembleOptions
-from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
+from jaxmap.evaluation.evaluate import evaluate_map
+from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.files import bundled
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
 from jaxmap.runs.config import DepthConfig, MapConfig
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import plan_run
 
 CELL_M, RANGE_M = 0.2, 8.0
@@ -121,7 +122,7 @@ def scored(plan: Any, voxel_map: Any, truth: Path) -> dict[str, Any]:
     site_origin, crs = plan.sequence.site_origin, plan.sequence.crs
     params, rule = plan.params.fusion, plan.rule
     layers = ensemble_layers(voxel_map, params, rule)
-    class_map = class_map_of(voxel_map, params, rule, "rock", site_origin=site_origin, crs=crs)
+    class_map = class_layer_of(voxel_map, params, rule, "rock", site_origin=site_origin, crs=crs)
     class_map = replace(class_map, ensemble=np.asarray(layers.probability))
     raster = read_truth([truth], class_map.place, TruthOptions())
     return evaluate_map(class_map, raster, None, ScoringOptions(cell_size_m=CELL_M)).scores["ensemble"]

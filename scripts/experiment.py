@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 from ladder import COARSE, POINTS, confusions, fused
 
-from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
+from jaxmap.evaluation.evaluate import evaluate_map
 from jaxmap.evaluation.map_scores import confusion_scores
+from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames
 from jaxmap.runs.config import DepthConfig, MapConfig, load_config

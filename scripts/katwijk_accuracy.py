@@ -26,7 +26,7 @@ from jaxmap.datasets.katwijk import CAMERAS, open_katwijk  # noqa: E402
 from jaxmap.datasets.katwijk_rover import R_BODY_IMU  # noqa: E402
 from jaxmap.datasets.pose_files import read_poses  # noqa: E402
 from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at  # noqa: E402
-from jaxmap.evaluation.pose_scores import PoseErrors, pose_errors  # noqa: E402
+from jaxmap.evaluation.geometry_scores import PoseErrors, pose_errors  # noqa: E402
 
 T_IMU_CAMERA = CAMERAS["loccam"].T_mount_camera
 T_BODY_CAMERA = np.block([[R_BODY_IMU, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]) @ T_IMU_CAMERA

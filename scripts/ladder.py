@@ -19,13 +19,13 @@ import numpy as np
 
 from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.evaluation.cells import CellGrid, column_shares, make_cells, map_cells
-from jaxmap.evaluation.evaluate import ClassMap
+from jaxmap.evaluation.evaluate import ClassLayer
 from jaxmap.evaluation.map_scores import Confusion, confusion_scores, count_confusion
 from jaxmap.evaluation.truth_cells import truth_cells
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
 from jaxmap.runs.config import DepthConfig, FusionConfig, GridConfig, MapConfig, load_config
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import Plan, plan_run
 
 POINTS = FusionConfig(per_frame="sum", carve=False, range_weighting=False, class_hit=1.0, class_miss=-1.0)
@@ -52,18 +52,18 @@ def rungs(base: MapConfig) -> Iterator[tuple[str, MapConfig]]:
     yield "the default: free space carved, too", base
 
 
-def fused(plan: Plan, frames: list[PreparedFrame], target: str) -> ClassMap:
+def fused(plan: Plan, frames: list[PreparedFrame], target: str) -> ClassLayer:
     """The map of the frames under a rule."""
     # The step is compiled for each rule; the frames are the same.
     steps = run_sequence(plan.mapper, plan.mapper.init(), frames, plan.params, plan.key)
     voxel_map, _ = deque(steps, maxlen=1).pop()
     sequence = plan.sequence
-    return class_map_of(
+    return class_layer_of(
         voxel_map, plan.params.fusion, plan.rule, target, site_origin=sequence.site_origin, crs=sequence.crs
     )
 
 
-def confusions(class_map: ClassMap, raster: LabelRaster, cell_size_m: float) -> list[Confusion]:
+def confusions(class_map: ClassLayer, raster: LabelRaster, cell_size_m: float) -> list[Confusion]:
     """The confusion on lattices of cells shifted by parts of a cell, the usual one first."""
     usual = make_cells(class_map.grid, cell_size_m)
     found = []

@@ -27,7 +27,7 @@ from jaxmap.evaluation.map_scores import confusion_scores
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
 from jaxmap.runs.config import DeeplabConfig, DepthConfig, MapConfig
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import Plan, plan_run
 
 CELL_M, RANGE_M = 0.2, 8.0
@@ -134,7 +134,7 @@ def scored(plan: Plan, frames: list[PreparedFrame], gt: Path) -> dict[str, float
     steps = run_sequence(plan.mapper, plan.mapper.init(), frames, plan.params, plan.key)
     voxel_map, _ = deque(steps, maxlen=1).pop()
     sequence = plan.sequence
-    class_map = class_map_of(
+    class_map = class_layer_of(
         voxel_map, plan.params.fusion, plan.rule, "rock", site_origin=sequence.site_origin, crs=sequence.crs
     )
     raster = read_truth([gt / "orthomosaic_labels.tif"], class_map.place, TruthOptions())

@@ -16,9 +16,9 @@ from PIL import Image
 from jaxmap.commands.main import main as jaxmap_main
 from jaxmap.export.voxels import occupied_voxels
 from jaxmap.report.demo_page import key_frame_row
-from jaxmap.report.html import in_3d
 from jaxmap.report.page import page
 from jaxmap.report.run_contents import read_run
+from jaxmap.report.run_page import in_3d
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "motorcycle.png"
 SIZE_PX = (1180, 1040)

@@ -25,7 +25,8 @@ from scipy.spatial.transform import Rotation
 from jaxmap.datasets import ReadOptions
 from jaxmap.datasets.pose_files import write_tum
 from jaxmap.errors import JaxmapError
-from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
+from jaxmap.evaluation.evaluate import evaluate_map
+from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.mapping.sequence import prepare_frames, run_sequence
@@ -34,7 +35,7 @@ from jaxmap.refinement.rounds import Ground, Refinement, refine
 from jaxmap.refinement.solve import Prior
 from jaxmap.refinement.views import pinhole
 from jaxmap.runs.config import DepthConfig, MapConfig
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import plan_run
 from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, ground_of, read_inputs
 
@@ -128,7 +129,7 @@ class Scorer:
         steps = run_sequence(plan.mapper, plan.mapper.init(), frames, plan.params, plan.key)
         voxel_map, _ = deque(steps, maxlen=1).pop()
         where = {"site_origin": plan.sequence.site_origin, "crs": plan.sequence.crs}
-        class_map = class_map_of(voxel_map, plan.params.fusion, plan.rule, "rock", **where)
+        class_map = class_layer_of(voxel_map, plan.params.fusion, plan.rule, "rock", **where)
         raster = read_truth([given.truth], class_map.place, TruthOptions())
         scores = evaluate_map(class_map, raster, None, ScoringOptions(cell_size_m=0.2)).scores
         return f"   map: rock IoU {scores['iou'] or 0.0:.3f}"

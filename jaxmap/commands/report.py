@@ -23,7 +23,7 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(ReportArguments, "report", words)
 
-    from jaxmap.report.html import write_report
+    from jaxmap.report.run_page import write_report
 
     Console().result(arguments.run, [write_report(arguments.run).name])
     return 0

@@ -17,11 +17,11 @@ from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import occupied_voxels
 from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE, ROVER_CLASSES
-from jaxmap.report.html import in_3d
 from jaxmap.report.inline import inline_image
 from jaxmap.report.page import page
 from jaxmap.report.pictures import overlay_labels
 from jaxmap.report.run_contents import read_run
+from jaxmap.report.run_page import in_3d
 from jaxmap.report.wording import value_text
 
 Row = Mapping[str, object]

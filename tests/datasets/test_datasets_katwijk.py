@@ -18,7 +18,7 @@ from jaxmap.datasets.katwijk_rover import CAMERAS, R_BODY_IMU, body_to_camera
 from jaxmap.datasets.pose_files import read_poses, write_tum
 from jaxmap.datasets.poses import poses_at
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.evaluation.pose_scores import pose_errors
+from jaxmap.evaluation.geometry_scores import pose_errors
 from jaxmap.host.files import config_folder
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 

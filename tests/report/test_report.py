@@ -23,7 +23,7 @@ from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.report import voxel_view as voxel_view_module
 from jaxmap.report.faces import exposed_faces, merge_voxels
-from jaxmap.report.html import MAX_KEY_FRAMES, write_report
+from jaxmap.report.run_page import MAX_KEY_FRAMES, write_report
 from jaxmap.report.voxel_view import voxel_view
 from jaxmap.report.wording import name_and_unit, number_text, value_text
 from jaxmap.types import VoxelMap, make_grid, make_voxel_map

@@ -15,7 +15,7 @@ from PIL import Image
 from test_report import make_run
 
 from jaxmap.labels import ROVER_CLASSES, class_colours
-from jaxmap.report.html import write_report
+from jaxmap.report.run_page import write_report
 
 pytestmark = pytest.mark.browser
 

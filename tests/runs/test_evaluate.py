@@ -15,7 +15,7 @@ from truth_files import SITE, write_map, write_raster
 
 from jaxmap.commands.evaluate import COLUMNS
 from jaxmap.report.error_map import error_colours
-from jaxmap.report.html import write_report
+from jaxmap.report.run_page import write_report
 
 ROCK = np.zeros((10, 8), bool)
 ROCK[2:6, 1:3] = True
@@ -124,7 +124,7 @@ def test_a_map_without_a_system_is_told_where_it_gets_one(cli, tmp_path):
 
 
 def test_the_error_map_shows_each_verdict_in_its_place(run, tmp_path):
-    from jaxmap.evaluation.evaluate import ScoringOptions
+    from jaxmap.evaluation.options import ScoringOptions
     from jaxmap.runs.evaluation import TruthOptions, evaluate_run
 
     evaluation, _ = evaluate_run(run, [truth_file(tmp_path)], TruthOptions(), ScoringOptions())
