@@ -14,11 +14,8 @@ from pathlib import Path
 from PIL import Image
 
 from jaxmap.commands.main import main as jaxmap_main
-from jaxmap.export.voxels import occupied_voxels
-from jaxmap.report.demo_page import key_frame_row
 from jaxmap.report.page import page
-from jaxmap.report.run_contents import read_run
-from jaxmap.report.run_page import in_3d
+from jaxmap.report.run_page import in_3d, key_frame_row, read_run
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "motorcycle.png"
 SIZE_PX = (1180, 1040)
@@ -36,8 +33,7 @@ def main() -> int:
         options = ["--depth.max-m", "5", "--grid.voxel-size-m", "0.025", "--stereo.mode", "hh4"]
         jaxmap_main(["map", "sample:motorcycle", "--out", str(folder / "run"), *options])
         run = read_run(folder / "run")
-        voxels = occupied_voxels(run.voxel_map, run.params, run.rule)
-        body = STYLE + key_frame_row(run.path) + in_3d(run, voxels)
+        body = STYLE + key_frame_row(run, next(iter(run.pictures))) + in_3d(run)
         (folder / "page.html").write_text(page("motorcycle", body, drawn=True), encoding="utf-8")
         flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         flags += ["--hide-scrollbars", "--virtual-time-budget=15000", f"--user-data-dir={folder / 'profile'}"]

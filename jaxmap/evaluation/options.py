@@ -31,6 +31,6 @@ class ScoringOptions:
         """Checks the bounds."""
         for name in ("cell_size_m", "rock_fraction", "found_share", "max_range_m"):
             value, is_share = getattr(self, name), name in ("rock_fraction", "found_share")
-            if value is not None and not (math.isfinite(value) and 0 < value and not (is_share and value > 1)):
+            if value is not None and not (math.isfinite(value) and value > 0 and not (is_share and value > 1)):
                 bound = " and at most 1" if is_share else ""
                 raise UsageError(f"{name} is {value}", where="scoring", fix=f"give a number above 0{bound}")

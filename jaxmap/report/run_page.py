@@ -1,34 +1,56 @@
-"""The report of a run: one page that needs no other file and no network."""
+"""The report of a run: one page from what lies in its folder."""
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+from jaxtyping import Float
 
+from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
-from jaxmap.host.files import atomic_path
-from jaxmap.report.inline import inline_image, script_text
-from jaxmap.report.missed_section import missed_section
-from jaxmap.report.page import page
-from jaxmap.report.run_contents import PICTURE_KINDS, RunContents, read_run
-from jaxmap.report.score_section import score_section
-from jaxmap.report.tables import group, metric_tables
+from jaxmap.fusion.params import stored_fusion
+from jaxmap.labels import class_colours
+from jaxmap.mapping.store import MapAttributes, load_map
+from jaxmap.report.page import (
+    figure,
+    header,
+    inline_image,
+    notes_section,
+    paper,
+    script_text,
+    section,
+    table,
+    write_page,
+)
 from jaxmap.report.voxel_view import voxel_view
-from jaxmap.report.wording import value_text
+from jaxmap.report.wording import (
+    MISSED_COLUMNS,
+    SCORE_COLUMNS,
+    name_and_unit,
+    number_text,
+    share_text,
+    value_text,
+)
 
 MAX_KEY_FRAMES = 12
 PICTURE_WIDTH_PX = 720
 
+_CAPTIONS = {"left": "Left image", "disparity": "Disparity, near red to far blue", "labels": "Labels"}
+_PICTURE_NAME = re.compile(rf"(?P<frame>.+)_(?P<kind>{'|'.join(_CAPTIONS)})\.png")
 _FILES = {
     "map.zarr": "the map, Zarr",
     "map.ply": "occupied voxels, point cloud",
-    "bev.tif": "view from above, GeoTIFF",
-    "bev.png": "view from above, picture",
+    "bev.tif": "top-down map, GeoTIFF",
+    "bev.png": "top-down map, picture",
     "missed.png": "where the map may have missed something, picture",
     "poses.tum": "poses of the left camera",
     "metrics.json": "all numbers of this page",
@@ -36,174 +58,315 @@ _FILES = {
     "scores.json": "scores against ground truth",
     "errors.png": "where map and ground truth differ, picture",
 }
-_KIND_CAPTIONS = {"left": "Left image", "disparity": "Disparity, near red to far blue", "labels": "Labels"}
+_GROUPS = ("camera", "grid", "times", "points", "voxels", "ensemble", "memory", "sequence")
+_ELSEWHERE = {"skipped", "notes", "stages", "by_class"}
+
+
+@dataclass(frozen=True)
+class RunContents:
+    """What a run left in its folder.
+
+    Attributes:
+        path: the folder.
+        voxels: the occupied ones of its map.
+        classes: of the map.
+        attributes: of the map.
+        frames_fused: into the map.
+        metrics: the content of `metrics.json`.
+        trajectory_world: positions of the left camera in the map's world, None without `poses.tum`.
+        pictures: paths by kind (left, disparity, labels), by the number of their key frame.
+        remarks: what could not be read.
+    """
+
+    path: Path
+    voxels: OccupiedVoxels
+    classes: tuple[str, ...]
+    attributes: MapAttributes
+    frames_fused: int
+    metrics: dict[str, Any]
+    trajectory_world: Float[np.ndarray, "N 3"] | None
+    pictures: dict[str, dict[str, Path]]
+    remarks: list[str]
+
+    @property
+    def name(self) -> str:
+        """That of the sequence, or else of the folder."""
+        return str(self.group("sequence").get("name") or self.path.resolve().name)
+
+    def group(self, key: str) -> dict[str, Any]:
+        """A group of metrics; empty where it is absent or no group."""
+        value = self.metrics.get(key)
+        return value if isinstance(value, dict) else {}
+
+
+def read_run(run: Path) -> RunContents:
+    """Reads a run folder.
+
+    Raises:
+        JaxmapError: the map or the metrics are missing or broken.
+    """
+    run = Path(run)
+    if not run.is_dir():
+        raise JaxmapError("no such run folder", where=run, fix="give a folder that `jaxmap map` wrote")
+    voxel_map, attributes = load_map(run / "map.zarr")
+    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, run / "map.zarr")
+    path, fix = run / "metrics.json", "finish the run (jaxmap map ... --resume), or bring the file back"
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise JaxmapError("no such file", where=path, fix=fix) from error
+    except (OSError, ValueError) as error:
+        raise JaxmapError(f"not readable as JSON ({error})", where=path, fix=fix) from error
+    if not isinstance(metrics, dict):
+        raise JaxmapError("not a JSON object", where=path, fix=fix)
+    trajectory_world, remarks = None, []
+    if (run / "poses.tum").is_file():
+        try:
+            trajectory_world = read_poses(run / "poses.tum").T[:, :3, 3] - attributes.site_origin
+        except JaxmapError:
+            remarks.append("poses.tum could not be read: the path is left out.")
+    pictures: dict[str, dict[str, Path]] = {}
+    for picture in sorted((run / "pictures").glob("*.png")):
+        if match := _PICTURE_NAME.fullmatch(picture.name):
+            pictures.setdefault(match["frame"], {})[match["kind"]] = picture
+    voxels, fused = occupied_voxels(voxel_map, params, rule), int(voxel_map.frames_fused)
+    return RunContents(run, voxels, voxel_map.classes, attributes, fused, metrics, trajectory_world, pictures, remarks)
 
 
 def write_report(run: Path) -> Path:
     """Writes `RUN/report.html` from what else is in the folder, and returns its path.
 
-    Pictures, the path, the view from above and the configuration are left out where they are missing.
+    Pictures, the path, the top-down map and the configuration are left out where they are missing.
 
     Raises:
         JaxmapError: the map or the metrics are missing or broken, or the disk is full or refuses.
     """
-    folder = read_run(Path(run))
-    voxels = occupied_voxels(folder.voxel_map, folder.params, folder.rule)
-    remarks = list(folder.remarks)
-    sections = [
-        _header(folder, voxels),
-        _from_above(folder, remarks),
-        missed_section(folder, remarks),
-        score_section(folder.path, remarks),
-        in_3d(folder, voxels),
-        _key_frames(folder, remarks),
-        f"<section><h2>Figures</h2>{metric_tables(folder.metrics, folder.voxel_map.classes)}</section>",
-        _skipped(folder.metrics),
-        _notes(folder.metrics, remarks),
-        _configuration(folder),
-        _links(folder),
+    contents = read_run(Path(run))
+    path, metrics, remarks = contents.path, contents.metrics, contents.remarks
+    skipped, notes = (contents.group("sequence").get(key) for key in ("skipped", "notes"))
+    rows = [
+        (value_text(entry.get("frame")), value_text(entry.get("reason")))
+        for entry in (skipped if isinstance(skipped, list) else ())
+        if isinstance(entry, dict)
     ]
-    content = page(_name(folder), "".join(sections), drawn=len(voxels.label) > 0)
-    target = folder.path / "report.html"
-    with atomic_path(target) as temporary:
-        temporary.write_text(content, encoding="utf-8")
-    return target
+    config, version = path / "config.yaml", metrics.get("jaxmap_version")
+    text = escape(config.read_text(encoding="utf-8", errors="replace")) if config.is_file() else ""
+    settings = f"<details><summary>All settings, as resolved</summary><pre>{text}</pre></details>" if text else ""
+    links = "".join(
+        f'<li><a href="{quote(name)}">{name}</a><span>{text}</span></li>'
+        for name, text in _FILES.items()
+        if (path / name).exists()
+    )
+    body = [
+        _header(contents),
+        section("Top-down map", paper(path / "bev.png", f"Top-down map of {contents.name}", remarks)),
+        missed_section(path, metrics, remarks),
+        _score_section(path, remarks),
+        in_3d(contents),
+        section("Key frames", _key_frames(contents)),
+        section("Metrics", _metric_tables(contents)),
+        section("Skipped frames", f'<div class="list">{table((), rows, "plain")}</div>' if rows else ""),
+        notes_section([*(notes if isinstance(notes, list) else []), *remarks]),
+        section("Configuration", settings),
+        section("Files", f'<ul class="files">{links}</ul>'),
+        f"<footer>Made by jaxmap{f' {escape(str(version))}' if version else ''}.</footer>",
+    ]
+    return write_page(path / "report.html", contents.name, "".join(body), drawn=len(contents.voxels.label) > 0)
 
 
-def _name(folder: RunContents) -> str:
-    return str(group(folder.metrics, "sequence").get("name") or folder.path.resolve().name)
-
-
-def _header(folder: RunContents, voxels: OccupiedVoxels) -> str:
-    metrics, sequence = folder.metrics, group(folder.metrics, "sequence")
+def _header(contents: RunContents) -> str:
+    metrics, sequence, voxels = contents.metrics, contents.group("sequence"), contents.voxels
     facts = [
         sequence.get("dataset"),
         f"labels: {metrics['labeller']}" if metrics.get("labeller") else None,
-        Path(str(model)).name if (model := group(metrics, "model").get("file")) else None,
-        sequence.get("crs") or folder.attributes.crs,
+        Path(str(model)).name if (model := contents.group("model").get("file")) else None,
+        sequence.get("crs") or contents.attributes.crs,
     ]
-    progress = folder.attributes.progress
-    banner = ""
+    banner, progress = "", contents.attributes.progress
     if progress.get("complete") is False:
         numbers = {key: value for key, value in progress.items() if isinstance(value, int) and key != "complete"}
-        told = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in numbers.items())
-        how_far = escape(f" ({told})" if told else "")
-        banner = f'<p class="banner">This run was interrupted{how_far}: the map is of its first part.</p>'
-    stats = "".join(f"<div><dt>{name}</dt><dd>{text}</dd></div>" for name, text in _stats(folder, voxels))
-    line = " · ".join(escape(str(fact)) for fact in facts if fact)
-    return (
-        f'<header><p class="kind">Semantic voxel map</p><h1>{escape(_name(folder))}</h1><p>{line}</p>{banner}'
-        f'<dl class="stats">{stats}</dl></header>'
-    )
-
-
-def _stats(folder: RunContents, voxels: OccupiedVoxels) -> list[tuple[str, str]]:
-    sequence, times = group(folder.metrics, "sequence"), group(folder.metrics, "times")
-    skipped = sequence.get("skipped")
-    cell_m2 = float(np.prod(voxels.voxel_size_m[:2].astype(np.float64)))
-    area_m2 = len(np.unique(voxels.index[:, :2], axis=0)) * cell_m2
-    peak_mib = group(folder.metrics, "memory").get("peak_resident_mib")
-    length_m, rate = sequence.get("path_length_m"), times.get("frames_per_s")
-    stats: list[tuple[str, Any]] = [
-        ("frames fused", value_text(int(folder.voxel_map.frames_fused))),
+        done = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in numbers.items())
+        banner = f"This run was interrupted{f' ({done})' if done else ''}: the map is of its first part."
+    area_m2 = len(np.unique(voxels.index[:, :2], axis=0)) * float(np.prod(voxels.voxel_size_m[:2].astype(np.float64)))
+    peak_mib, skipped = contents.group("memory").get("peak_resident_mib"), sequence.get("skipped")
+    length_m, rate = sequence.get("path_length_m"), contents.group("times").get("frames_per_s")
+    stats: list[tuple[str, str | None]] = [
+        ("frames fused", value_text(contents.frames_fused)),
         ("frames skipped", value_text(len(skipped)) if isinstance(skipped, list) else None),
         ("path", value_text(round(float(length_m), 1), "m") if isinstance(length_m, int | float) else None),
         ("area observed", value_text(round(area_m2) if area_m2 >= 100 else area_m2, "m²")),
         ("occupied voxels", value_text(len(voxels.label))),
         ("frames/s", value_text(float(rate)) if isinstance(rate, int | float) else None),
-        ("peak memory", _memory(peak_mib) if isinstance(peak_mib, int | float) else None),
     ]
-    return [(name, text) for name, text in stats if text is not None]
+    if isinstance(peak_mib, int | float):
+        large = peak_mib >= 1024
+        stats.append(
+            ("peak memory", value_text(*((round(peak_mib / 1024, 2), "GiB") if large else (round(peak_mib), "MiB"))))
+        )
+    return header("Semantic voxel map", contents.name, " · ".join(str(fact) for fact in facts if fact), stats, banner)
 
 
-def _memory(mib: float) -> str:
-    return value_text(round(mib / 1024, 2), "GiB") if mib >= 1024 else value_text(round(mib), "MiB")
+def missed_section(path: Path, metrics: dict[str, Any], remarks: list[str]) -> str:
+    """Where the map may have missed its class: the picture and what is expected; empty without an ensemble.
+
+    A picture that cannot be read is left out with a remark.
+    """
+    ensemble = metrics.get("ensemble")
+    if not isinstance(ensemble, dict) or not ensemble:
+        return ""
+    target = escape(str(ensemble.get("class")))
+    image = paper(path / "missed.png", f"Probability that the map missed {target}", remarks)
+    area = {key: value_text(ensemble.get(f"{key}_area_m2"), "m²") for key in ("observed", "missed", "called")}
+    area["missed"] = value_text(ensemble.get("missed_area_expected_m2"), "m²")
+    text = (
+        f"The probability that a place which the map does not call {target} is {target}, by an ensemble of "
+        f"{value_text(ensemble.get('members'))} maps, each with errors of its own in poses, disparities and the "
+        f"sensor model. Over all {area['observed']} observed, {area['missed']} of {target} are expected to be missed, "
+        f"beside {area['called']} called so."
+    )
+    return section("What may be missed", f"<p>{text}</p>{image}" if image else "")
 
 
-def _from_above(folder: RunContents, remarks: list[str]) -> str:
-    path = folder.path / "bev.png"
-    if not path.is_file():
+def _score_section(run: Path, remarks: list[str]) -> str:
+    """Scores and error map that `jaxmap evaluate` left in a run folder."""
+    if not (run / "scores.json").is_file():
         return ""
     try:
-        image = inline_image(path, f"Map of {_name(folder)} seen from above")
-    except JaxmapError:
-        remarks.append(f"{path.name} could not be read: the view from above is left out.")
+        text = _scores(json.loads((run / "scores.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        remarks.append("scores.json could not be read: the scores are left out.")
         return ""
-    return f'<section><h2>From above</h2><div class="paper">{image}</div></section>'
+    image = paper(run / "errors.png", "Rock that was found, falsely called and missed", remarks)
+    return section("Against ground truth", text + image)
 
 
-def in_3d(folder: RunContents, voxels: OccupiedVoxels) -> str:
+def _scores(scores: dict[str, Any]) -> str:
+    def listed(title: str, columns: Iterable[tuple[str, str]], rows: Iterable[tuple[str, dict[str, Any]]]) -> str:
+        keys, headings = zip(*columns, strict=True)
+        cells = [(escape(name), *(value_text(values.get(key)) for key in keys)) for name, values in rows]
+        return f'<div class="tables"><figure>{table((title, *headings), cells)}</figure></div>'
+
+    rocks = scores.get("rocks") if isinstance(scores.get("rocks"), dict) else {}
+    facts = {"cells": scores.get("cells"), "frames": scores.get("frames")}
+    facts |= {"rocks in view": rocks.get("count"), "of them missed": rocks.get("missed")}
+    size, reach = scores.get("cell_size_m"), scores.get("max_range_m")
+    within = f", within {value_text(reach, 'm')}" if reach is not None else ""
+    counted = ", ".join(f"{value_text(value)} {name}" for name, value in facts.items() if value is not None)
+    rows = [("observed cells", scores), ("all cells in view", scores["in_view"])]
+    if "registration" in scores:
+        rows.append(("observed, before registration", scores["registration"]["before"]))
+    html = (
+        f"<p>Scored for {escape(str(scores.get('class')))} in cells of {value_text(size, 'm')}{within}: {counted}.</p>"
+        + listed("Counted", SCORE_COLUMNS.items(), rows)
+    )
+    if "ensemble" in scores:
+        ensemble = scores["ensemble"]
+        bins = [(f"{number_text(row['from'])} to {number_text(row['to'])}", row) for row in ensemble["reliability"]]
+        html += (
+            f"<p>Of {value_text(ensemble['cells'])} cells that the map does not call so, "
+            f"{value_text(ensemble['missed_cells'])} are; the ensemble expected "
+            f"{value_text(float(ensemble['expected_missed_cells']))}.</p>"
+        )
+        ranked = [("the ensemble", ensemble), ("the map alone", ensemble["map_alone"])]
+        html += listed("Missed cells, by", MISSED_COLUMNS.items(), ranked)
+        columns = {"cells": "cells", "said": "mean", "true": "truly missed"}
+        html += listed("Probability of a miss", columns.items(), bins)
+    return html
+
+
+def in_3d(contents: RunContents) -> str:
     """The section with the interactive view; a page holds one at most."""
-    if not len(voxels.label):
-        return "<section><h2>In 3D</h2><p>No voxel is occupied.</p></section>"
-    view = voxel_view(voxels, folder.voxel_map.classes, folder.trajectory_world)
-    return (
-        '<section><h2>In 3D</h2><div id="view3d" class="view3d" role="figure" '
-        f'aria-label="Occupied voxels of {escape(_name(folder))} in 3D, to turn by dragging"></div>'
-        f"<p>{escape(view.caption)} Drag to turn, scroll to come closer.</p>"
-        f'<script type="application/json" id="view3d-data">{script_text(str(view.figure.to_json()))}</script></section>'
+    if not len(contents.voxels.label):
+        return section("In 3D", "<p>No voxel is occupied.</p>")
+    view = voxel_view(contents.voxels, contents.classes, contents.trajectory_world)
+    return section(
+        "In 3D",
+        '<div id="view3d" class="view3d" role="figure" '
+        f'aria-label="Occupied voxels of {escape(contents.name)} in 3D, to turn by dragging"></div>'
+        f"<p>{escape(view.caption)} Drag to turn, scroll to zoom.</p>"
+        f'<script type="application/json" id="view3d-data">{script_text(str(view.figure.to_json()))}</script>',
     )
 
 
-def _key_frames(folder: RunContents, remarks: list[str]) -> str:
-    frames = list(folder.pictures)
+def key_frame_row(contents: RunContents, frame: str) -> str:
+    """The pictures of a key frame side by side; those that cannot be read are left out with a remark."""
+    figures = ""
+    for kind, caption in _CAPTIONS.items():
+        if path := contents.pictures[frame].get(kind):
+            try:
+                figures += figure(inline_image(path, f"{caption}, frame {frame}", width_px=PICTURE_WIDTH_PX), caption)
+            except JaxmapError:
+                contents.remarks.append(f"pictures/{path.name} could not be read and is left out.")
+    return f'<div class="row">{figures}</div>' if figures else ""
+
+
+def _key_frames(contents: RunContents) -> str:
+    frames = list(contents.pictures)
     if len(frames) > MAX_KEY_FRAMES:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, MAX_KEY_FRAMES).round().astype(int)]
-    rows = []
-    for frame in frames:
-        figures = []
-        for kind in PICTURE_KINDS:
-            if path := folder.pictures[frame].get(kind):
-                try:
-                    image = inline_image(path, f"{_KIND_CAPTIONS[kind]}, frame {frame}", width_px=PICTURE_WIDTH_PX)
-                except JaxmapError:
-                    remarks.append(f"pictures/{path.name} could not be read and is left out.")
-                    continue
-                figures.append(f"<figure>{image}<figcaption>{_KIND_CAPTIONS[kind]}</figcaption></figure>")
-        if figures:
-            rows.append(
-                f'<div class="frame"><h3>Frame {escape(frame)}</h3><div class="row">{"".join(figures)}</div></div>'
-            )
+    rows = {frame: row for frame in frames if (row := key_frame_row(contents, frame))}
     if not rows:
         return ""
-    told = f"<p>{len(rows)} of {len(folder.pictures)} key frames.</p>" if len(rows) < len(folder.pictures) else ""
-    return f'<section><h2>Key frames</h2><div class="frames">{"".join(rows)}</div>{told}</section>'
+    shown = "".join(f'<div class="frame"><h3>Frame {escape(frame)}</h3>{row}</div>' for frame, row in rows.items())
+    more = f"<p>{len(rows)} of {len(contents.pictures)} key frames.</p>" if len(rows) < len(contents.pictures) else ""
+    return f'<div class="frames">{shown}</div>{more}'
 
 
-def _skipped(metrics: dict[str, Any]) -> str:
-    skipped = group(metrics, "sequence").get("skipped")
-    if not isinstance(skipped, list) or not skipped:
-        return ""
-    rows = "".join(
-        f'<tr><th scope="row">{value_text(entry.get("frame"))}</th><td>{value_text(entry.get("reason"))}</td></tr>'
-        for entry in skipped
-        if isinstance(entry, dict)
-    )
-    return f'<section><h2>Skipped frames</h2><div class="list"><table><tbody>{rows}</tbody></table></div></section>'
+def _metric_tables(contents: RunContents) -> str:
+    """All metrics, one table for each group; keys that are not known here are shown all the same."""
+    metrics, wide = contents.metrics, ""
+    stages, by_class = contents.group("times").get("stages"), contents.group("voxels").get("by_class")
+    if isinstance(stages, dict):
+        known = {name: stage for name, stage in stages.items() if isinstance(stage, dict)}
+        most = max((_number(stage.get("total_s")) for stage in known.values()), default=0.0) or 1.0
+        rows = [
+            (
+                escape(str(name).replace("_", " ")),
+                *(_number_text(stage.get(key)) for key in ("median_ms", "p95_ms", "total_s")),
+                _bar(_number(stage.get("total_s")) / most),
+            )
+            for name, stage in known.items()
+        ]
+        if rows:
+            wide += figure(table(("Stage", "median, ms", "95 %, ms", "total, s", ""), rows), "Stages")
+    if isinstance(by_class, dict) and by_class:
+        wide += _class_table(by_class, contents.classes)
+    groups = {key: metrics[key] for key in dict.fromkeys((*_GROUPS, *metrics)) if isinstance(metrics.get(key), dict)}
+    groups["other"] = {key: value for key, value in metrics.items() if key not in (*_GROUPS, *groups)}
+    cards = ""
+    for name, values in groups.items():
+        rows = [row for key, value in values.items() if key not in _ELSEWHERE for row in _metric_rows(key, value)]
+        cards += figure(table((), rows, "plain"), name_and_unit(name)[0]) if rows else ""
+    return f'<div class="tables">{wide}<div class="cards">{cards}</div></div>'
 
 
-def _notes(metrics: dict[str, Any], remarks: list[str]) -> str:
-    notes = group(metrics, "sequence").get("notes")
-    told = [*(notes if isinstance(notes, list) else []), *remarks]
-    items = "".join(f"<li>{escape(str(note))}</li>" for note in told)
-    return f"<section><h2>Notes</h2><ul>{items}</ul></section>" if items else ""
+def _class_table(by_class: dict[str, Any], classes: Sequence[str]) -> str:
+    colours = dict(zip(classes, class_colours(classes).tolist(), strict=False))
+    total = sum(map(_number, by_class.values())) or 1.0
+    rows = []
+    for name, count in by_class.items():
+        share, colour = _number(count) / total, f"rgb{tuple(colours.get(name, class_colours(())[0].tolist()))}"
+        swatch = f'<i class="swatch" style="background:{colour}"></i>'
+        rows.append((swatch + escape(str(name)), value_text(count), share_text(share), _bar(share, colour)))
+    return figure(table(("Class", "voxels", "share", ""), rows), "Occupied voxels by class")
 
 
-def _configuration(folder: RunContents) -> str:
-    if not folder.config_text:
-        return ""
-    return (
-        "<section><h2>Configuration</h2><details><summary>All settings, as resolved</summary>"
-        f"<pre>{escape(folder.config_text)}</pre></details></section>"
-    )
+def _metric_rows(key: str, value: object, prefix: str = "") -> list[tuple[str, str]]:
+    if isinstance(value, dict):
+        return [row for inner, item in value.items() for row in _metric_rows(inner, item, f"{prefix}{key} ")]
+    name, unit = name_and_unit(f"{prefix}{key}")
+    if isinstance(value, float) and key.endswith("fraction"):
+        return [(name, share_text(value))]
+    return [(name, value_text(value, unit, key))]
 
 
-def _links(folder: RunContents) -> str:
-    items = "".join(
-        f'<li><a href="{quote(name)}">{name}</a><span>{told}</span></li>'
-        for name, told in _FILES.items()
-        if (folder.path / name).exists()
-    )
-    version = folder.metrics.get("jaxmap_version")
-    made = f"Made by jaxmap {escape(str(version))}." if version else "Made by jaxmap."
-    return f'<section><h2>Files</h2><ul class="files">{items}</ul></section><footer>{made}</footer>'
+def _bar(share: float, colour: str = "var(--bar)") -> str:
+    return f'<td class="bar"><i style="width:{100 * share:.1f}%;background:{colour}"></i></td>'
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _number_text(value: object) -> str:
+    return number_text(float(value)) if isinstance(value, int | float) else "–"

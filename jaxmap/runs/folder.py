@@ -24,8 +24,8 @@ from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_lab
 from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.mapping.store import MapAttributes, holds_map, load_map
-from jaxmap.report.missed_plan import missed_picture
-from jaxmap.report.pictures import colourise_disparity, overlay_labels, top_down_picture
+from jaxmap.report.pictures import colourise_disparity, overlay_labels
+from jaxmap.report.top_down import missed_picture, top_down_picture
 from jaxmap.runs.log import RunLog
 from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.types import VoxelMap

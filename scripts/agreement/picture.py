@@ -12,8 +12,7 @@ from agreement.causes import CAUSES, Differences, agreement_of
 from agreement.maps import FREE, OCCUPIED, TwoMaps
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.files import atomic_path
-from jaxmap.report.plan_sheet import DPI, FAINT, INK
-from jaxmap.report.relief import UNOBSERVED_COLOUR
+from jaxmap.report.top_down import DPI, FAINT, INK, UNOBSERVED_COLOUR
 from jaxmap.types import GridSpec
 
 if TYPE_CHECKING:
