@@ -57,7 +57,10 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], rows: Seq
         ),
         section("Scores", f'<div class="tables"><figure>{scores}</figure></div>'),
         section("Ground truth", _truth(out, shown.path, truth)),
-        section("Top-down maps and their errors", "".join(_map_and_errors(out, row) for row in reversed(rows))),
+        section(
+            "Top-down maps and their errors",
+            f'<div class="frames">{"".join(_map_and_errors(out, row) for row in reversed(rows))}</div>',
+        ),
         in_3d(shown),
     ]
     return write_page(out / "report.html", title, "".join(bodies), drawn=len(shown.voxels.label) > 0)
@@ -99,7 +102,7 @@ def _cut(path: Path, bounds: BoundingBox) -> np.ndarray:
             part = from_bounds(*bounds, transform=file.transform).round_offsets().round_lengths()
             return file.read(window=part.intersection(whole.round_offsets().round_lengths()))
     except RasterioError as error:
-        raise JaxmapError("not a readable raster", where=path, fix="install jaxmap anew") from error
+        raise JaxmapError("not a readable raster", where=path, fix="reinstall jaxmap") from error
 
 
 def _map_and_errors(out: Path, row: Row) -> str:

@@ -21,7 +21,7 @@ _TINT, _UNOBSERVED_DIM = 0.72, 0.55
 _PAPER = (250, 250, 248)
 _SHADES = {UNLABELLED: _PAPER, OTHER: (226, 219, 205), TARGET: (168, 160, 150)}
 
-# Okabe and Ito's colours, which colour-blind people tell apart, too.
+# Okabe and Ito's colours, which colour-blind people can distinguish.
 _VERDICTS = {
     "rock, found (TP)": (0, 158, 115),
     "no rock, called rock (FP)": (213, 94, 0),
@@ -84,7 +84,8 @@ def error_colours(
         for code, shade in _SHADES.items():
             ground[fine == code] = shade
     else:
-        ground = backdrop.astype(np.float64)
+        # Samples outside the orthomosaic are black.
+        ground = np.where(backdrop.any(axis=-1, keepdims=True), backdrop, np.array(_PAPER)).astype(np.float64)
         per_cell = len(ground) // evaluation.cells.shape[0]
     pale = samples_of(~evaluation.counted, per_cell)[..., None] * _UNOBSERVED_DIM
     ground = (1 - pale) * ground + pale * np.array(_PAPER)

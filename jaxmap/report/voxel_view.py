@@ -204,7 +204,7 @@ def _scene(points_world: Float[np.ndarray, "N 3"]) -> dict[str, Any]:
     span_m = np.maximum(high - low, 1e-2)
     longest_m = span_m[:2].max()
     turn = np.deg2rad(-66.0 if span_m[0] >= span_m[1] else -24.0)
-    slant, distance = np.deg2rad(40.0), 1.65
+    slant, distance = np.deg2rad(40.0), 1.9
     across = np.array([np.cos(turn), np.sin(turn), 0.0])
     # What is near looks larger: looking a little before the middle fills the view evenly.
     centre = 0.16 * across
