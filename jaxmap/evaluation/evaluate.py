@@ -117,7 +117,8 @@ def evaluate_map(
         in_view = np.isfinite(range_m)
     here, cells = _around(whole, in_view | np.asarray(said.observed))
     said = MapCells(*(np.asarray(leaf)[here] for leaf in said))
-    observed, range_m, in_view = np.asarray(said.observed), range_m[here], in_view[here]
+    observed, probability = np.asarray(said.observed), np.asarray(said.probability)
+    range_m, in_view = range_m[here], in_view[here]
     asked = observed & (in_view if options.max_range_m is not None else True)
     called = said.called(options.rock_fraction)
 
@@ -127,8 +128,8 @@ def evaluate_map(
     def scored(truth: TruthCells) -> dict[str, Any]:
         """Scores over the counted cells, and `in_view` over the domain; coverage is that of the domain in both."""
         truly = truth.truly(options.rock_fraction)
-        in_domain = score_cells(called, said.probability, truly, in_view & truth.labelled, observed)
-        counted = score_cells(called, said.probability, truly, asked & truth.labelled, observed)
+        in_domain = score_cells(called, probability, truly, in_view & truth.labelled, observed)
+        counted = score_cells(called, probability, truly, asked & truth.labelled, observed)
         return counted | {"coverage": in_domain["coverage"], "in_view": in_domain}
 
     alignment = Alignment()

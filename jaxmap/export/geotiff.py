@@ -6,6 +6,7 @@ import json
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -61,7 +62,9 @@ def write_geotiff(
         raise JaxmapError(
             f"unknown coordinate reference system {crs!r}", where=path, fix='give a name such as "EPSG:32631"'
         ) from error
-    profile = dict(driver="GTiff", count=count, height=height, width=width, dtype="float32", nodata=np.nan)
+    profile: dict[str, Any] = dict(
+        driver="GTiff", count=count, height=height, width=width, dtype="float32", nodata=np.nan
+    )
     profile |= dict(compress="deflate", predictor=3, interleave="band", crs=reference)
     profile |= dict(transform=Affine(east_m, 0.0, west, 0.0, -north_m, south + height * north_m))
     with warnings.catch_warnings(), MemoryFile() as memory:

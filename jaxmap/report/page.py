@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 _POLICY = "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 INK, QUIET, LINE, ACCENT, BAR = "#1f242b", "#667080", "#e4e1d9", "#b23c2e", "#c9b48d"
-"""The colours of a light page, as page.css has them; charts in them follow the theme."""
-_THEME = {INK: "var(--ink)", QUIET: "var(--quiet)", LINE: "var(--line)", ACCENT: "var(--accent)", BAR: "var(--bar)"}
+"""The colours of a light page, as page.css has them."""
+THEME = {INK: "--ink", QUIET: "--quiet", LINE: "--line", ACCENT: "--accent", BAR: "--bar"}
+"""Their CSS variables."""
 
 
 def page(title: str, body: str, *, drawn: bool) -> str:
@@ -145,8 +146,14 @@ def paper(path: Path, alt: str, remarks: list[str]) -> str:
         return ""
 
 
-def svg_of(drawing: Figure, alt: str) -> str:
-    """A matplotlib figure as inline SVG: the page's fonts, and for its colours those of the reader's theme."""
+def svg_of(drawing: Figure, title: str, variables: Mapping[str, str] = THEME) -> str:
+    """A matplotlib figure as an SVG element, in the fonts of the page.
+
+    Args:
+        drawing: in the colours of a light page.
+        title: for those who cannot see it.
+        variables: CSS variables by the colours that they replace, so that a dark page has its own.
+    """
     from matplotlib import rc_context
 
     buffer = io.StringIO()
@@ -155,9 +162,9 @@ def svg_of(drawing: Figure, alt: str) -> str:
     # The style that matplotlib adds would hold for the whole page, and its names occur once in each chart.
     text = re.sub(r"(?s)<metadata>.*?</metadata>|<style.*?</style>| id=\"[a-zA-Z.]+\w*_\d+\"", "", buffer.getvalue())
     text = re.sub(r"'DejaVu Sans'[^;\"]*", "system-ui, sans-serif", text[text.index("<svg") :])
-    for colour, name in _THEME.items():
-        text = text.replace(colour, name)
-    return text.replace("<svg", f'<svg class="chart" role="img" aria-label="{escape(alt)}"', 1)
+    for colour, name in variables.items():
+        text = text.replace(colour, f"var({name})")
+    return text.replace("<svg", f'<svg class="chart" role="img" aria-label="{escape(title)}"', 1)
 
 
 def script_text(content: str) -> str:

@@ -246,7 +246,7 @@ def _scores(scores: dict[str, Any]) -> str:
         cells = [(escape(name), *(value_text(values.get(key)) for key in keys)) for name, values in rows]
         return f'<div class="tables"><figure>{table((title, *headings), cells)}</figure></div>'
 
-    rocks = scores.get("rocks") if isinstance(scores.get("rocks"), dict) else {}
+    rocks = scores.get("rocks") or {}
     facts = {"cells": scores.get("cells"), "frames": scores.get("frames")}
     facts |= {"rocks in view": rocks.get("count"), "of them missed": rocks.get("missed")}
     size, reach = scores.get("cell_size_m"), scores.get("max_range_m")

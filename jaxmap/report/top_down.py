@@ -85,9 +85,7 @@ def draw(sheet: Sheet, path: str | os.PathLike[str], overlay: Callable[[Axes], o
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.font_manager import FontProperties
     from matplotlib.ticker import MultipleLocator
-    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
     end_m = sheet.origin_m + sheet.cell_m * sheet.colours.shape[:2] / sheet.per_cell
     low_m, high_m = sheet.box_m or (sheet.origin_m, end_m)
@@ -133,27 +131,12 @@ def draw(sheet: Sheet, path: str | os.PathLike[str], overlay: Callable[[Axes], o
     title_at = (_LEFT_PX / width, 1 - 42 / height)
     figure.text(*title_at, sheet.title, size=13, weight="bold", va="center", color=INK)
 
-    top = legend_px / height
     spacing: dict[str, Any] = dict(handlelength=1.1, handleheight=1.1, columnspacing=1.6, borderaxespad=0, borderpad=0)
-    anchor: dict[str, Any] = dict(loc="upper left", bbox_to_anchor=(_LEFT_PX / width, top), ncols=columns)
-    figure.legend(handles, names, **anchor, frameon=False, fontsize=_TEXT, labelcolor=INK, **spacing)
-    length_m = _nice(0.11 * map_width / px_per_m)
-    scale = dict(label_top=True, color=INK, frameon=False, pad=0, borderpad=0, sep=5, size_vertical=4 / px_per_m)
-    at: dict[str, Any] = dict(bbox_to_anchor=(1 - 110 / width, top), bbox_transform=figure.transFigure)
-    font = FontProperties(size=_TEXT)
-    text = f"{length_m:g} m"
-    figure.add_artist(
-        AnchoredSizeBar(axes.transData, length_m, text, "upper right", fontproperties=font, **scale, **at)
+    anchor: dict[str, Any] = dict(
+        loc="upper left", bbox_to_anchor=(_LEFT_PX / width, legend_px / height), ncols=columns
     )
-    if sheet.georeferenced:
-        arrow = dict(arrowstyle="-|>,head_length=0.6,head_width=0.3", color=INK, shrinkA=0, shrinkB=0)
-        north = dict(
-            xycoords="figure pixels", textcoords="figure pixels", color=INK, size=_TEXT, weight="bold", ha="center"
-        )
-        x = width - _RIGHT_PX - 14
-        axes.annotate(
-            "N", (x, legend_px), (x, legend_px - 52), va="top", arrowprops=arrow, annotation_clip=False, **north
-        )
+    figure.legend(handles, names, **anchor, frameon=False, fontsize=_TEXT, labelcolor=INK, **spacing)
+    _draw_scale(axes, (width - _RIGHT_PX, legend_px), _nice(0.11 * map_width / px_per_m), north=sheet.georeferenced)
     if sheet.bar:
         _draw_bar(figure.add_axes((_LEFT_PX / width, 54 / height, 400 / width, 18 / height)), sheet.bar)
     with atomic_path(path) as temporary:
@@ -175,6 +158,25 @@ def _legend(sheet: Sheet) -> tuple[list[Any], list[str]]:
         looks = {"path": dict(color=INK, linewidth=1.8), "start": _START, "end": _END}
         entries += [(name, Line2D([], [], **look)) for name, look in looks.items()]
     return [handle for _, handle in entries], [name for name, _ in entries]
+
+
+def _draw_scale(axes: Axes, corner_px: tuple[int, int], length_m: float, *, north: bool) -> None:
+    """Draws a scale and an arrow to the north, with their upper right corner at a place of the figure."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.transforms import IdentityTransform
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+
+    right, top = corner_px
+    at: dict[str, Any] = dict(bbox_to_anchor=(right - 60, top), bbox_transform=IdentityTransform())
+    look: dict[str, Any] = dict(fontproperties=FontProperties(size=_TEXT), label_top=True, color=INK, frameon=False)
+    space: dict[str, Any] = dict(pad=0, borderpad=0, sep=5, size_vertical=length_m / 50)
+    scale = AnchoredSizeBar(axes.transData, length_m, f"{length_m:g} m", "upper right", **look, **space, **at)
+    axes.figure.add_artist(scale)
+    if north:
+        arrow = dict(arrowstyle="-|>,head_length=0.6,head_width=0.3", color=INK, shrinkA=0, shrinkB=0)
+        text: dict[str, Any] = dict(color=INK, size=_TEXT, weight="bold", ha="center", va="top", annotation_clip=False)
+        text |= dict(xycoords="figure pixels", textcoords="figure pixels", arrowprops=arrow)
+        axes.annotate("N", (right - 14, top), (right - 14, top - 52), **text)
 
 
 def _draw_bar(axes: Axes, bar: ColourBar) -> None:

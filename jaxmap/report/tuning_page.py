@@ -128,7 +128,8 @@ def _losses(stage: Stage) -> str:
 def _calibration(bins: Mapping[str, Any]) -> str:
     drawing, axes = _chart("predicted probability", "observed share")
     axes.plot([0, 1], [0, 1], color=QUIET, linestyle=":", linewidth=1, label="ideal")
-    for when, look in (("before", dict(color=BAR)), ("after", dict(color=ACCENT, linewidth=2.4))):
+    looks: dict[str, Any] = {"before": dict(color=BAR), "after": dict(color=ACCENT, linewidth=2.4)}
+    for when, look in looks.items():
         points = sorted((row["said"], row["true"]) for row in bins[when])
         axes.plot(*zip(*points, strict=True) if points else ((), ()), marker="o", markersize=3.5, label=when, **look)
     axes.set(xlim=(0, 1), ylim=(0, 1))
