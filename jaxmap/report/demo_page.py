@@ -40,10 +40,10 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], rows: Seq
         JaxmapError: a run is missing or broken, or the page cannot be written.
     """
     shown = read_run(out / str(rows[-1]["run"]))
-    frames = (
-        f"{shown.frames_fused} stereo frames of a simulated beach become a 3D semantic voxel map, with two labellers "
-        "(a fitted plane and a network) under two presets (the paper's and jaxmap's). Each top-down map is scored "
-        "against the labelled orthomosaic."
+    lead = (
+        f"{int(shown.voxel_map.frames_fused)} stereo frames of a simulated beach become a 3D semantic voxel map, with "
+        "two labellers (a fitted plane and a network) under two presets (the paper's and jaxmap's). Each top-down map "
+        "is scored against the labelled orthomosaic."
     )
     text = [key for key in columns if isinstance(rows[0][key], str)]
     heading = " / ".join(columns[key] for key in text)
@@ -51,7 +51,7 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], rows: Seq
     cells = [(_name(row), *(_score_text(row[key]) for key in numbers)) for row in rows]
     scores = table((heading, *(escape(columns[key]) for key in numbers)), cells)
     bodies = [
-        header("jaxmap demo", title, frames),
+        header("jaxmap demo", title, lead),
         section(
             "Input, disparity and labels", key_frame_row(shown, next(iter(shown.pictures))) if shown.pictures else ""
         ),

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from jaxmap.datasets.pose_files import read_poses
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
-from jaxmap.fusion.params import stored_fusion
+from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
 from jaxmap.labels import class_colours
 from jaxmap.mapping.store import MapAttributes, load_map
 from jaxmap.report.page import (
@@ -40,6 +40,7 @@ from jaxmap.report.wording import (
     share_text,
     value_text,
 )
+from jaxmap.types import VoxelMap
 
 MAX_KEY_FRAMES = 12
 PICTURE_WIDTH_PX = 720
@@ -68,10 +69,10 @@ class RunContents:
 
     Attributes:
         path: the folder.
-        voxels: the occupied ones of its map.
-        classes: of the map.
-        attributes: of the map.
-        frames_fused: into the map.
+        voxel_map: the map, with its attributes.
+        params: of fusion, by which the map is read.
+        rule: of fusion, likewise.
+        voxels: the occupied ones.
         metrics: the content of `metrics.json`.
         trajectory_world: positions of the left camera in the map's world, None without `poses.tum`.
         pictures: paths by kind (left, disparity, labels), by the number of their key frame.
@@ -79,10 +80,11 @@ class RunContents:
     """
 
     path: Path
-    voxels: OccupiedVoxels
-    classes: tuple[str, ...]
+    voxel_map: VoxelMap
     attributes: MapAttributes
-    frames_fused: int
+    params: FusionParams
+    rule: FusionRule
+    voxels: OccupiedVoxels
     metrics: dict[str, Any]
     trajectory_world: Float[np.ndarray, "N 3"] | None
     pictures: dict[str, dict[str, Path]]
@@ -129,8 +131,8 @@ def read_run(run: Path) -> RunContents:
     for picture in sorted((run / "pictures").glob("*.png")):
         if match := _PICTURE_NAME.fullmatch(picture.name):
             pictures.setdefault(match["frame"], {})[match["kind"]] = picture
-    voxels, fused = occupied_voxels(voxel_map, params, rule), int(voxel_map.frames_fused)
-    return RunContents(run, voxels, voxel_map.classes, attributes, fused, metrics, trajectory_world, pictures, remarks)
+    voxels = occupied_voxels(voxel_map, params, rule)
+    return RunContents(run, voxel_map, attributes, params, rule, voxels, metrics, trajectory_world, pictures, remarks)
 
 
 def write_report(run: Path) -> Path:
@@ -191,7 +193,7 @@ def _header(contents: RunContents) -> str:
     peak_mib, skipped = contents.group("memory").get("peak_resident_mib"), sequence.get("skipped")
     length_m, rate = sequence.get("path_length_m"), contents.group("times").get("frames_per_s")
     stats: list[tuple[str, str | None]] = [
-        ("frames fused", value_text(contents.frames_fused)),
+        ("frames fused", value_text(int(contents.voxel_map.frames_fused))),
         ("frames skipped", value_text(len(skipped)) if isinstance(skipped, list) else None),
         ("path", value_text(round(float(length_m), 1), "m") if isinstance(length_m, int | float) else None),
         ("area observed", value_text(round(area_m2) if area_m2 >= 100 else area_m2, "m²")),
@@ -278,7 +280,7 @@ def in_3d(contents: RunContents) -> str:
     """The section with the interactive view; a page holds one at most."""
     if not len(contents.voxels.label):
         return section("In 3D", "<p>No voxel is occupied.</p>")
-    view = voxel_view(contents.voxels, contents.classes, contents.trajectory_world)
+    view = voxel_view(contents.voxels, contents.voxel_map.classes, contents.trajectory_world)
     return section(
         "In 3D",
         '<div id="view3d" class="view3d" role="figure" '
@@ -330,7 +332,7 @@ def _metric_tables(contents: RunContents) -> str:
         if rows:
             wide += figure(table(("Stage", "median, ms", "95 %, ms", "total, s", ""), rows), "Stages")
     if isinstance(by_class, dict) and by_class:
-        wide += _class_table(by_class, contents.classes)
+        wide += _class_table(by_class, contents.voxel_map.classes)
     groups = {key: metrics[key] for key in dict.fromkeys((*_GROUPS, *metrics)) if isinstance(metrics.get(key), dict)}
     groups["other"] = {key: value for key, value in metrics.items() if key not in (*_GROUPS, *groups)}
     cards = ""

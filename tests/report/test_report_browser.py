@@ -17,7 +17,7 @@ from test_report import make_run
 from jaxmap.labels import ROVER_CLASSES, class_colours
 from jaxmap.report.run_page import write_report
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 _BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 # Chromium's own advice on a canvas that plotly reads back.
