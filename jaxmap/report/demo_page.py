@@ -72,7 +72,9 @@ def _name(row: Row) -> str:
 
 
 def _score_text(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) and value < 10 else value_text(value)
+    if not isinstance(value, float):
+        return value_text(value)
+    return f"{value:.3f}" if value < 10 else value_text(round(value))
 
 
 def _truth(out: Path, run: Path, truth: Path) -> str:
