@@ -50,7 +50,7 @@ def as_numpy(top: TopDown) -> TopDown:
 
 
 @settings(max_examples=8)
-@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, (), tuple("abcdefghijklmnopqrstu")]))
+@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, ()]))
 def test_occupied_voxels_are_those_of_the_map(seed, classes) -> None:
     voxel_map, params, rule = random_map(seed, classes), make_fusion_params(classes), FusionRule()
     voxels = occupied_voxels(voxel_map, params, rule)
@@ -99,7 +99,7 @@ def test_ply_of_nothing_and_of_odd_names(tmp_path) -> None:
 
 
 @settings(max_examples=8)
-@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, (), tuple("abcdefghijklmnopqrstu")]), st.booleans())
+@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, ()]), st.booleans())
 def test_geotiff_holds_each_column_at_its_place(tmp_path_factory, seed, classes, georeferenced) -> None:
     import rasterio
 
