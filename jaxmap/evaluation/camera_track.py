@@ -1,4 +1,4 @@
-"""Which cells the cameras looked at, and from how far: the domain that does not depend on what a map observed."""
+"""Which cells the cameras see, and from how far: a domain that does not depend on what a map observed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CameraTrack:
         focal_px: fx, fy.
         centre_px: cx, cy.
         size_px: width, height.
-        max_range_m: how far the map was made; cells beyond it are not asked for.
+        max_range_m: greatest depth that was mapped; cells beyond it are not in view.
     """
 
     T_world_camera: Float64[np.ndarray, "N 4 4"]
@@ -34,16 +34,15 @@ class CameraTrack:
 def view_range(
     cells: CellGrid, ground_m: Float[np.ndarray, "I J"], track: CameraTrack, max_range_m: float
 ) -> Float64[np.ndarray, "I J"]:
-    """How near a camera came to each cell while it looked at it: infinite where none did within the range.
+    """Distance of the nearest camera that sees each cell, metres: infinite where none does within the range.
 
-    A camera looks at a cell where the cell's centre, on the ground, falls into its image; the range is the distance
-    between the two. Rocks that hide a cell are not considered.
+    A camera sees a cell whose centre, on the ground, projects into its image. Occlusion is not considered.
 
     Args:
         cells: the cells.
         ground_m: height of the ground in each, world (`ground_height`).
         track: the cameras.
-        max_range_m: how far they look.
+        max_range_m: how far they see.
     """
     x, y = cells.centres()
     nearest_m = np.full(cells.shape, np.inf)

@@ -255,13 +255,13 @@ def find_rocks(
     domain: Bool[np.ndarray, "I J"],
     range_m: Float[np.ndarray, "I J"],
 ) -> Rocks:
-    """Takes the truth apart into connected rocks (corners connect), at its own resolution.
+    """Splits the truth into connected rocks (8-connectivity), at its own resolution.
 
     Args:
         truth: in cells.
         cell_size_m: of a cell.
         called: cells that the map calls rock.
-        domain: cells that are asked for.
+        domain: cells in which rocks count.
         range_m: how near a camera came to each cell (`view_range`).
     """
     from scipy.ndimage import find_objects, label
@@ -285,7 +285,7 @@ def find_rocks(
 
 
 def rock_table(rocks: Rocks, found_share: float = 0.5) -> dict[str, Any]:
-    """How many rocks there are and how many of them are missed, in all, by size and by range.
+    """Counts of rocks and of missed rocks, in all, by size and by range.
 
     A rock is found where at least `found_share` of its area lies in cells called rock.
     """

@@ -11,7 +11,7 @@ CALIBRATION_BINS = 15
 RELIABILITY_EDGES = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
 """Of the bins of a reliability table: finer near zero, where rare things have their probabilities."""
 _LEAST_PROBABILITY = 1e-6
-"""Probabilities are kept this far from 0 and 1 in the likelihood: one certain mistake must not make it infinite."""
+"""Probabilities are clipped this far from 0 and 1 in the likelihood: one certain mistake must not make it infinite."""
 
 
 class Confusion(NamedTuple):
@@ -38,7 +38,7 @@ def count_confusion(
 
 
 def confusion_scores(confusion: Confusion) -> dict[str, float | None]:
-    """Accuracy, IoU, precision, recall and F1; None where a quotient has nothing below its line."""
+    """Accuracy, IoU, precision, recall and F1; None where a denominator is zero."""
     tp, fp, fn, tn = confusion
     return {
         "accuracy": _quotient(tp + tn, confusion.total),
@@ -116,8 +116,8 @@ def roc_auc(score: Float[np.ndarray, "N"], truth: Bool[np.ndarray, "N"]) -> floa
 def average_precision(score: Float[np.ndarray, "N"], truth: Bool[np.ndarray, "N"]) -> float | None:
     """Area under the precision-recall curve, as the sum of precision times the recall gained at each score.
 
-    Equal scores are taken together, so that their order does not matter. None without a true one; a number that says
-    nothing has the share of true ones.
+    Equal scores are taken together, so that their order does not matter. None without a true one; an uninformative
+    number has the share of true ones.
     """
     score, truth = np.asarray(score, np.float64), np.asarray(truth, bool)
     if not truth.any():

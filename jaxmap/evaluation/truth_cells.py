@@ -36,7 +36,7 @@ class Alignment:
     pivot_m: tuple[float, float] = (0.0, 0.0)
 
     def inverse(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points of the map lay in the truth before it was moved."""
+        """The points of the unmoved truth that lie at points of the map."""
         dx, dy = x - self.shift_m[0] - self.pivot_m[0], y - self.shift_m[1] - self.pivot_m[1]
         cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
         return self.pivot_m[0] + cos * dx + sin * dy, self.pivot_m[1] - sin * dx + cos * dy
@@ -68,7 +68,7 @@ def truth_cells(
     alignment: Alignment | None = None,
     per_cell: int | None = None,
 ) -> TruthCells:
-    """Brings a raster of truth, of any system and affine, to cells.
+    """Aggregates a raster of truth, of any coordinate system and affine transform, into cells.
 
     Each cell is sampled on a regular lattice, finer than the pixels where they are coarse: on pixels that fill cells
     in whole numbers the shares are exact. Between the corners of a cell coordinates are interpolated, which is exact
@@ -119,7 +119,7 @@ def pixel_corners(
     """Finds the corners of cells in an image; the arguments are those of `truth_cells`.
 
     Raises:
-        JaxmapError: there is no way between the two systems.
+        JaxmapError: no transformation between the two systems is known.
     """
     origin = np.zeros(2) if site_origin is None else np.asarray(site_origin, np.float64)[:2]
     x, y = np.meshgrid(*cells.corners(), indexing="ij")
@@ -172,7 +172,7 @@ def soft_iou(
 ) -> float:
     """Intersection over union of shares of cells, `sum min / sum max` (Ruzicka 1958): IoU where they are 0 or 1.
 
-    It moves with every sample of the truth, where the IoU of cells moves in jumps.
+    It changes with every sample of the truth, where the IoU of cells changes in steps.
     """
     low = np.minimum(map_share, truth_share)[counted].sum()
     high = np.maximum(map_share, truth_share)[counted].sum()
@@ -182,7 +182,7 @@ def soft_iou(
 def register(overlap: Callable[[Alignment], float], pivot_m: tuple[float, float]) -> Alignment:
     """The motion of the truth, within +-0.5 m and +-2 degrees, at which it overlaps the map best; coarse to fine.
 
-    A motion must gain: of equals the smallest is kept, no motion before all.
+    A motion must gain: of equals the smallest is kept, and no motion at all before any other.
 
     Args:
         overlap: how well the truth fits the map when it is moved; the more the better.

@@ -158,11 +158,14 @@ def write_key_frame(
     folder: RunFolder, index: int, rectified: RectifiedFrame, labels: np.ndarray | None, classes: tuple[str, ...]
 ) -> None:
     """Writes the pictures of one frame: left image, disparity and, where there are any, labels."""
+    from PIL import Image
+
     pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
     for kind, picture in pictures.items():
-        _write_image(folder, f"{index:06d}_{kind}.png", picture)
+        with atomic_path(folder.pictures / f"{index:06d}_{kind}.png") as temporary:
+            Image.fromarray(picture).save(temporary)
 
 
 EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.png"}
@@ -229,10 +232,3 @@ def count_missed(rule: FusionRule, attributes: MapAttributes, voxel_map: VoxelMa
             "greatest_missed_probability": round(float(np.nanmax(missed, initial=0.0)), 4),
         }
     }
-
-
-def _write_image(folder: RunFolder, name: str, picture: np.ndarray) -> None:
-    from PIL import Image
-
-    with atomic_path(folder.pictures / name) as temporary:
-        Image.fromarray(picture).save(temporary)
