@@ -35,7 +35,7 @@ class Alignment:
     heading_rad: float = 0.0
     pivot_m: tuple[float, float] = (0.0, 0.0)
 
-    def inverse(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def undone(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The points of the unmoved truth that lie at points of the map."""
         dx, dy = x - self.shift_m[0] - self.pivot_m[0], y - self.shift_m[1] - self.pivot_m[1]
         cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
@@ -124,7 +124,7 @@ def pixel_corners(
     origin = np.zeros(2) if site_origin is None else np.asarray(site_origin, np.float64)[:2]
     x, y = np.meshgrid(*cells.corners(), indexing="ij")
     if alignment is not None:
-        x, y = alignment.inverse(x, y)
+        x, y = alignment.undone(x, y)
     x, y = transform_between(crs, image_crs, "ground truth")(x + origin[0], y + origin[1])
     T_pixel_crs = np.linalg.inv(T_crs_pixel)
     column, row = (T_pixel_crs[axis, 0] * x + T_pixel_crs[axis, 1] * y + T_pixel_crs[axis, 2] for axis in (0, 1))
