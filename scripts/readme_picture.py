@@ -21,7 +21,7 @@ import jaxmap as jm
 from jaxmap.commands.main import main as jaxmap_main
 from jaxmap.datasets.samples import sample_truth
 from jaxmap.labels import class_colours
-from jaxmap.report.run_contents import RunContents, read_run
+from jaxmap.report.run_page import RunContents, read_run
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "traverse.png"
 OPTIONS = "--labeller deeplab --depth.max-m 8 --grid.voxel-size-m 0.05 --stereo.mode hh4 --stereo.speckle-window 1000"

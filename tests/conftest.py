@@ -35,7 +35,7 @@ NETWORK_MODULES = tuple(
 CHECKED_MODULES = (
     *FUSION_MODULES,
     *NETWORK_MODULES,
-    "evaluation.pose_scores",
+    "evaluation.geometry_scores",
     "evaluation.segmentation_scores",
     "geometry",
     "labellers.deeplab",

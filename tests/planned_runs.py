@@ -34,7 +34,7 @@ def ran(sequence: Path, out: Path, **settings: object) -> dict:
     folder = RunFolder(out)
     config = config_of(**settings)
     plan = planned(sequence, **settings)
-    folder.begin(plan, config, resume=False, overwrite=False)
+    folder.begin(plan.settings(config), resume=False, overwrite=False)
     return run_plan(plan, folder, strict=config.strict, checkpoint_every_s=60.0, notify=lambda line: None)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import rasterio
 from rasterio import Affine
 
-from jaxmap.evaluation.evaluate import ClassMap
+from jaxmap.evaluation.evaluate import ClassLayer
 from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.types import GridSpec, VoxelMap
 
@@ -41,13 +41,13 @@ def write_raster(
     return path
 
 
-def class_map(rock: np.ndarray, observed: np.ndarray | None = None, *, voxel_m=0.2, origin_m=(0.0, 0.0), **more):
+def class_layer(rock: np.ndarray, observed: np.ndarray | None = None, *, voxel_m=0.2, origin_m=(0.0, 0.0), **more):
     """A map seen from above with these columns (x first); certain of what it says."""
     observed = np.ones_like(rock) if observed is None else observed
     grid = GridSpec(jnp.asarray([*origin_m, 0.0], jnp.float32), jnp.full(3, voxel_m, jnp.float32), (*rock.shape, 1))
     probability = np.where(rock, 0.9, 0.1).astype(np.float32)
     height_m = np.where(observed, 0.0, np.nan)
-    return ClassMap(grid, rock & observed, probability, observed, height_m, **more)
+    return ClassLayer(grid, rock & observed, probability, observed, height_m, **more)
 
 
 def write_map(run: Path, rock: np.ndarray, observed: np.ndarray, *, voxel_m=0.2, origin_m=(0.0, 0.0), crs=CRS) -> Path:

@@ -77,8 +77,8 @@ def main(words: Sequence[str]) -> int:
 
 def _map_and_score(out: Path, config: MapConfig, truth: Path, console: Console) -> tuple[dict, dict]:
     """One row: a run and its scores, written into the run folder."""
-    from jaxmap.evaluation.evaluate import ScoringOptions
-    from jaxmap.report.html import write_report
+    from jaxmap.evaluation.options import ScoringOptions
+    from jaxmap.report.run_page import write_report
     from jaxmap.runs.evaluation import TruthOptions, evaluate_run, write_evaluation
     from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.mapping import run_plan
@@ -87,10 +87,10 @@ def _map_and_score(out: Path, config: MapConfig, truth: Path, console: Console) 
     folder = RunFolder(out)
     plan = plan_run(SAMPLE, config, console.notify)
     with folder.locked():
-        folder.begin(plan, config, resume=False, overwrite=True)
+        folder.begin(plan.settings(config), resume=False, overwrite=True)
         metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify)
-    evaluation, class_map = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
-    write_evaluation(folder.scores, folder.errors, evaluation, class_map, truth / "orthomosaic.tif")
+    evaluation, layer = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
+    write_evaluation(folder.scores, folder.errors, evaluation, layer, truth / "orthomosaic.tif")
     write_report(out)
     return metrics, evaluation.scores
 

@@ -1,9 +1,9 @@
-"""`jaxmap evaluate`: scores a map against ground truth seen from above."""
+"""`jaxmap evaluate`: scores a top-down map against ground truth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -11,17 +11,18 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import JaxmapError, UsageError, options_as
+from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.host.output_folder import check_inputs_stay
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
 
 
 @dataclass(frozen=True)
 class EvaluateArguments:
-    """Score the map of a run against ground truth seen from above.
+    """Score the top-down map of a run against ground truth.
 
     Cells count where the map observed a surface and the truth is labelled; the second row counts every labelled cell
     in the cameras' view, with unobserved ones as not rock. An ensemble (jaxmap map --ensemble.members) is scored by how
-    well it tells the missed cells among those not called rock. Writes scores.json and errors.png (true, false and
+    well it predicts the missed cells among those not called rock. Writes scores.json and errors.png (true, false and
     missed rock in colours) into the run folder and its report, or --out and OUT_errors.png.
     """
 
@@ -34,14 +35,7 @@ class EvaluateArguments:
     """JSON file to write; by default scores.json in the run folder."""
     target: Annotated[str, tyro.conf.arg(name="class")] = "rock"
     """The class that is scored."""
-    rock_fraction: float = 0.5
-    """A cell is rock where rock covers this share: in the truth of its labelled area, in the map of its area."""
-    cell_size_m: float = 0.2
-    """Edge of a cell."""
-    max_range_m: float | None = None
-    """Count only cells that a camera looked at from so near."""
-    register: bool = False
-    """Shift (to 0.5 m) and turn (to 2 degrees) the truth to where it fits best; reported with the scores before."""
+    scoring: Annotated[ScoringOptions, tyro.conf.arg(name="")] = field(default_factory=ScoringOptions)
     remap: tuple[str, ...] = ()
     """What the values of the orthomosaic mean: 0=unlabelled 7=rock '*=sand', or colours: '#b23c2e=rock'."""
     palette: Path | None = None
@@ -50,8 +44,6 @@ class EvaluateArguments:
     """Coordinate reference system of the ground truth, in place of its own."""
     rock_diameters_m: tuple[float, float, float] = (0.3, 0.6, 1.0)
     """Diameters of small, medium and large rocks in lists that give none."""
-    found_share: float = 0.5
-    """A rock is found where this share of its area lies in cells called rock."""
     backdrop: Path | None = None
     """An RGB orthomosaic to draw the errors on."""
 
@@ -63,12 +55,17 @@ RANKING_COLUMNS = {"by": "missed, by", **MISSED_COLUMNS}
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(EvaluateArguments, "evaluate", words)
-    _check(arguments)
+    if not arguments.ground_truth:
+        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
+    if arguments.out is not None and arguments.out.suffix.lower() != ".json":
+        raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
+    if min(arguments.rock_diameters_m) <= 0:
+        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
 
     from jaxmap.datasets.label_raster import choose_coding
     from jaxmap.datasets.rock_list import SIZE_CLASSES
-    from jaxmap.evaluation.evaluate import ScoringOptions
     from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.report.run_page import write_report
     from jaxmap.runs.evaluation import TruthOptions, evaluate_run, summary, write_evaluation
     from jaxmap.runs.folder import RunFolder
 
@@ -82,51 +79,24 @@ def main(words: Sequence[str]) -> int:
     check_inputs_stay((out, picture), read)
     diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
     coding = choose_coding(arguments.remap, arguments.palette)
-    options = ScoringOptions(
-        cell_size_m=arguments.cell_size_m,
-        rock_fraction=arguments.rock_fraction,
-        max_range_m=arguments.max_range_m,
-        register=arguments.register,
-        found_share=arguments.found_share,
-    )
     # The system of a map is that of the poses it was made of.
     with options_as(lambda option: "jaxmap map --crs" if option == "--crs" else option):
-        evaluation, class_map = evaluate_run(
-            arguments.run,
-            arguments.ground_truth,
-            TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m),
-            options,
-        )
+        truth = TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m)
+        evaluation, layer = evaluate_run(arguments.run, arguments.ground_truth, truth, arguments.scoring)
     scores = evaluation.scores
-    write_evaluation(out, picture, evaluation, class_map, arguments.backdrop)
+    write_evaluation(out, picture, evaluation, layer, arguments.backdrop)
     for note in scores["notes"]:
         console.notify(f"note: {note}")
     _print_scores(console, scores, summary(scores))
     names = [out.name, picture.name]
     if arguments.out is None and folder.metrics.is_file():
-        names += _report_anew(console, arguments.run)
+        # The scores go into the report; a run that is incomplete has none.
+        try:
+            names.append(write_report(arguments.run).name)
+        except JaxmapError as error:
+            console.notify(f"note: the report was not written again: {error}")
     console.result(out.parent, names)
     return 0
-
-
-def _check(arguments: EvaluateArguments) -> None:
-    if not arguments.ground_truth:
-        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
-    if arguments.out is not None and arguments.out.suffix.lower() != ".json":
-        raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
-    if min(arguments.rock_diameters_m) <= 0:
-        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
-
-
-def _report_anew(console: Console, run: Path) -> list[str]:
-    """Puts the scores into the report of the run; a run that is not whole has none."""
-    from jaxmap.report.html import write_report
-
-    try:
-        return [write_report(run).name]
-    except JaxmapError as error:
-        console.notify(f"note: the report was not written anew: {error}")
-        return []
 
 
 def _print_scores(console: Console, scores: dict, title: str) -> None:

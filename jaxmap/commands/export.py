@@ -14,7 +14,7 @@ from jaxmap.commands.console import Console, parse
 
 @dataclass(frozen=True)
 class ExportArguments:
-    """Write the map of a run as PLY (occupied voxels), GeoTIFF (view from above) or PNG.
+    """Write the map of a run as PLY (occupied voxels), GeoTIFF (top-down map) or PNG.
 
     Where the run has an ensemble, the GeoTIFF holds its layers, and a second PNG shows what the map may have missed.
     """

@@ -68,9 +68,9 @@ def main(words: Sequence[str]) -> int:
     console = Console()
     folder = RunFolder(arguments.out)
     plan = plan_run(arguments.sequence, config, console.notify)
-    folder.check_apart(plan, config)
+    folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     with folder.locked(), console.progress("mapping", len(plan.sequence.frames)) as advance:
-        folder.begin(plan, config, resume=arguments.resume, overwrite=arguments.overwrite)
+        folder.begin(plan.settings(config), resume=arguments.resume, overwrite=arguments.overwrite)
         metrics = run_plan(
             plan,
             folder,

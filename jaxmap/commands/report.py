@@ -1,4 +1,4 @@
-"""`jaxmap report`: the HTML report of a run, written anew."""
+"""`jaxmap report`: writes the HTML report of a run again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxmap.commands.console import Console, parse
 
 @dataclass(frozen=True)
 class ReportArguments:
-    """Write report.html of a run anew, from what lies in its folder."""
+    """Write report.html of a run again, from what is in its folder."""
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
@@ -23,7 +23,7 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(ReportArguments, "report", words)
 
-    from jaxmap.report.html import write_report
+    from jaxmap.report.run_page import write_report
 
     Console().result(arguments.run, [write_report(arguments.run).name])
     return 0

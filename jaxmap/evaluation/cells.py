@@ -1,8 +1,8 @@
-"""The cells that maps are scored in, and what a map says of each: the one place that defines it.
+"""The cells that maps are scored in, and what a map predicts for each.
 
-A cell may hold any number of columns of voxels, whole or in part. All is counted by area, because a rock's steep
-face throws many points into a cell that it hardly covers. Ground that was not observed is not rock, and of it a
-map says its prior: a few stray points do not make a cell.
+A cell may hold any number of columns of voxels, whole or in part. They are weighted by area, because a rock's steep
+face puts many points into a cell that it hardly covers. Ground that was not observed counts as not rock, with the
+prior as its probability: a few stray points do not make a cell.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ColumnShares(NamedTuple):
 
 
 class MapCells(NamedTuple):
-    """What a map says of each cell.
+    """What a map predicts for each cell.
 
     `observed`: a surface was seen in some column of it; `share`: of its area, that of the columns labelled with the
     class; `probability`: that a point of it is of the class, the mean over its area, the class prior where nothing
@@ -122,7 +122,7 @@ def map_cells(
     shares: ColumnShares,
     prior: float = 0.5,
 ) -> MapCells:
-    """Brings the columns of a map to cells; differentiable in `probability` (and in a soft `is_class`).
+    """Aggregates the columns of a map into cells; differentiable in `probability` (and in a soft `is_class`).
 
     Args:
         is_class: whether a column is labelled with the class, or how much.

@@ -1,4 +1,4 @@
-"""Scores of geometry: disparity against truth, depth between frames, surfaces against surfaces."""
+"""Scores of geometry: disparity against truth, depth between frames, poses against truth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
 
 from jaxmap.geometry.camera import disparity_to_points, points_to_pixels, transform_points
 from jaxmap.types import StereoCamera
@@ -89,3 +90,35 @@ def depth_consistency(
     predicted_m = np.asarray(points_b)[landed][seen, 2]
     measured_m = measured[rows, columns, 2][seen]
     return (predicted_m - measured_m) / measured_m
+
+
+class PoseErrors(NamedTuple):
+    """Errors without sign, (N,) each: in metres, and in degrees within 180."""
+
+    position_m: np.ndarray
+    heading_deg: np.ndarray
+    roll_deg: np.ndarray
+    pitch_deg: np.ndarray
+
+
+def pose_errors(
+    T_world_camera: Float64[np.ndarray, "N 4 4"],
+    T_world_camera_true: Float64[np.ndarray, "N 4 4"],
+    T_body_camera: Float64[np.ndarray, "*N 4 4"],
+) -> PoseErrors:
+    """Compares the cameras' positions, and the attitudes of the body that carries them.
+
+    Args:
+        T_world_camera: estimated.
+        T_world_camera_true: true, in the same z-up world.
+        T_body_camera: where the camera is in the body (x forward, y left, z up), whose heading, roll
+            and pitch are compared.
+    """
+    R_camera_body = np.swapaxes(T_body_camera[..., :3, :3], -1, -2)
+    angles, true_angles = (
+        Rotation.from_matrix(T[:, :3, :3] @ R_camera_body).as_euler("ZYX", degrees=True)
+        for T in (T_world_camera, T_world_camera_true)
+    )
+    heading, pitch, roll = np.abs((angles - true_angles + 180) % 360 - 180).T
+    position = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_camera_true[:, :3, 3], axis=1)
+    return PoseErrors(position, heading, roll, pitch)

@@ -1,12 +1,14 @@
-"""Ground truth brought to cells: how much of each cell's labelled area is of the class."""
+"""Ground truth in cells: how much of each cell's labelled area is of the class, and how the truth is registered."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 
 from jaxmap.datasets.crs import transform_between
 from jaxmap.datasets.label_raster import TARGET, UNLABELLED, LabelRaster, sample_nearest
@@ -17,12 +19,16 @@ _CHUNK_SAMPLES = 2**21
 _MOST_IN_ALL = 2**27
 _SNAP = 1e-9
 
+MAX_SHIFT_M, MAX_HEADING_RAD = 0.5, float(np.deg2rad(2.0))
+_SHIFT_STEPS, _HEADING_STEPS, _REFINEMENTS = 4, 2, 4
+_LEAST_GAIN = 1e-6
+
 
 @dataclass(frozen=True)
 class Alignment:
-    """A small motion of the ground truth over the map: turned about a pivot, then shifted.
+    """A small rigid motion of the ground truth over the map: turned about a pivot, then shifted.
 
-    `heading_rad` turns counter-clockwise (seen from above); shift and pivot are x and y, world, metres.
+    `heading_rad` turns counter-clockwise about z; shift and pivot are x and y, world, metres.
     """
 
     shift_m: tuple[float, float] = (0.0, 0.0)
@@ -30,7 +36,7 @@ class Alignment:
     pivot_m: tuple[float, float] = (0.0, 0.0)
 
     def undone(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points of the map lay in the truth before it was moved."""
+        """The points of the unmoved truth that lie at points of the map."""
         dx, dy = x - self.shift_m[0] - self.pivot_m[0], y - self.shift_m[1] - self.pivot_m[1]
         cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
         return self.pivot_m[0] + cos * dx + sin * dy, self.pivot_m[1] - sin * dx + cos * dy
@@ -62,7 +68,7 @@ def truth_cells(
     alignment: Alignment | None = None,
     per_cell: int | None = None,
 ) -> TruthCells:
-    """Brings a raster of truth, of any system and affine, to cells.
+    """Aggregates a raster of truth, of any coordinate system and affine transform, into cells.
 
     Each cell is sampled on a regular lattice, finer than the pixels where they are coarse: on pixels that fill cells
     in whole numbers the shares are exact. Between the corners of a cell coordinates are interpolated, which is exact
@@ -113,7 +119,7 @@ def pixel_corners(
     """Finds the corners of cells in an image; the arguments are those of `truth_cells`.
 
     Raises:
-        JaxmapError: there is no way between the two systems.
+        JaxmapError: no transformation between the two systems is known.
     """
     origin = np.zeros(2) if site_origin is None else np.asarray(site_origin, np.float64)[:2]
     x, y = np.meshgrid(*cells.corners(), indexing="ij")
@@ -159,3 +165,42 @@ def _between(corners: np.ndarray, count: int) -> np.ndarray:
         along_x = along_x.reshape(-1, corners.shape[1])
         both = along_x[:, :-1, None] * (1 - part) + along_x[:, 1:, None] * part
     return both.reshape(len(along_x), -1)
+
+
+def soft_iou(
+    map_share: Float[np.ndarray, "*s"], truth_share: Float[np.ndarray, "*s"], counted: Bool[np.ndarray, "*s"]
+) -> float:
+    """Intersection over union of shares of cells, `sum min / sum max` (Ruzicka 1958): IoU where they are 0 or 1.
+
+    It changes with every sample of the truth, where the IoU of cells changes in steps.
+    """
+    low = np.minimum(map_share, truth_share)[counted].sum()
+    high = np.maximum(map_share, truth_share)[counted].sum()
+    return float(low / high) if high > 0 else 0.0
+
+
+def register(overlap: Callable[[Alignment], float], pivot_m: tuple[float, float]) -> Alignment:
+    """The motion of the truth, within +-0.5 m and +-2 degrees, at which it overlaps the map best; coarse to fine.
+
+    A motion must gain: of equals the smallest is kept, and no motion at all before any other.
+
+    Args:
+        overlap: how well the truth fits the map when it is moved; the more the better.
+        pivot_m: what the truth turns about: x and y, world.
+    """
+    best = np.zeros(3)
+    best_overlap = overlap(Alignment(pivot_m=pivot_m))
+    reach = np.array([MAX_SHIFT_M, MAX_SHIFT_M, MAX_HEADING_RAD])
+    steps = np.array([_SHIFT_STEPS, _SHIFT_STEPS, _HEADING_STEPS])
+    for level in range(_REFINEMENTS + 1):
+        around = [range(-count, count + 1) for count in (steps if level == 0 else (1, 1, 1))]
+        offsets = sorted(itertools.product(*around), key=lambda offset: float(np.square(offset).sum()))
+        middle = best
+        for offset in offsets[1:]:
+            state = middle + np.array(offset) * reach / steps / 2**level
+            if (np.abs(state) > reach + 1e-9).any():
+                continue
+            alignment = Alignment((float(state[0]), float(state[1])), float(state[2]), pivot_m)
+            if (reached := overlap(alignment)) > best_overlap + _LEAST_GAIN:
+                best, best_overlap = state, reached
+    return Alignment((float(best[0]), float(best[1])), float(best[2]), pivot_m)

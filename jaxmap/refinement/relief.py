@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, percentile_filter
 
-from jaxmap.evaluation.registration import register
-from jaxmap.evaluation.truth_cells import Alignment
+from jaxmap.evaluation.truth_cells import Alignment, register
 from jaxmap.fusion.splat import splat_columns
 from jaxmap.refinement.anchors import Raster, sample_raster
 from jaxmap.refinement.rig import PER_FRAME, SHARED, Rig

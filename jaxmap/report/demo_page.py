@@ -1,4 +1,4 @@
-"""The page of `jaxmap demo`: what went in, the table, truth, maps and errors side by side, one map in 3D."""
+"""The page of `jaxmap demo`: input, scores, truth, maps and errors, and the last map in 3D."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from rasterio.errors import RasterioError
 from rasterio.windows import from_bounds
 
 from jaxmap.errors import JaxmapError
-from jaxmap.export.voxels import occupied_voxels
 from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE, ROVER_CLASSES
-from jaxmap.report.html import in_3d
-from jaxmap.report.inline import inline_image
-from jaxmap.report.page import page
+from jaxmap.report.page import figure, header, inline_image, section, table, write_page
 from jaxmap.report.pictures import overlay_labels
-from jaxmap.report.run_contents import read_run
+from jaxmap.report.run_page import in_3d, key_frame_row, read_run
 from jaxmap.report.wording import value_text
+
+_WIDTH_PX = 1000
 
 Row = Mapping[str, object]
 
@@ -41,51 +40,59 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], rows: Seq
         JaxmapError: a run is missing or broken, or the page cannot be written.
     """
     shown = read_run(out / str(rows[-1]["run"]))
-    voxels = occupied_voxels(shown.voxel_map, shown.params, shown.rule)
-    body = "".join(
-        [
-            f'<header><p class="kind">jaxmap demo</p><h1>{escape(title)}</h1></header>',
-            f"<section><h2>What went in, and its labels</h2>{key_frame_row(shown.path)}</section>",
-            f"<section><h2>Scores</h2>{_table(columns, rows)}</section>",
-            f"<section><h2>The truth from above</h2>{_truth(out, shown.path, truth)}</section>",
-            f"<section><h2>The maps from above</h2>{_pictures(out, rows, 'bev.png', 'Map from above')}</section>",
-            f"<section><h2>Where they err</h2>{_pictures(out, rows, 'errors.png', 'Errors')}</section>",
-            in_3d(shown, voxels),
-        ]
+    lead = (
+        f"{int(shown.voxel_map.frames_fused)} stereo frames of a simulated beach become a 3D semantic voxel map, with "
+        "two labellers (a fitted plane and a network) under two presets (the paper's and jaxmap's). Each top-down map "
+        "is scored against the labelled orthomosaic."
     )
-    target = out / "report.html"
-    with atomic_path(target) as temporary:
-        temporary.write_text(page(title, body, drawn=len(voxels.label) > 0), encoding="utf-8")
-    return target
+    text = [key for key in columns if isinstance(rows[0][key], str)]
+    heading = " / ".join(columns[key] for key in text)
+    numbers = [key for key in columns if key not in text]
+    cells = [(_name(row), *(_score_text(row[key]) for key in numbers)) for row in rows]
+    scores = table((heading, *(escape(columns[key]) for key in numbers)), cells)
+    bodies = [
+        header("jaxmap demo", title, lead),
+        section(
+            "Input, disparity and labels", key_frame_row(shown, next(iter(shown.pictures))) if shown.pictures else ""
+        ),
+        section("Scores", f'<div class="tables"><figure>{scores}</figure></div>'),
+        section("Ground truth", _truth(out, shown.path, truth)),
+        section(
+            "Top-down maps and their errors",
+            f'<div class="frames">{"".join(_map_and_errors(out, row) for row in reversed(rows))}</div>',
+        ),
+        in_3d(shown),
+    ]
+    return write_page(out / "report.html", title, "".join(bodies), drawn=len(shown.voxels.label) > 0)
 
 
-def key_frame_row(run: Path) -> str:
-    """The pictures of a run's first key frame, side by side."""
-    captions = {"left": "Left image", "disparity": "Disparity, near red to far blue", "labels": "Labels"}
-    figures = ""
-    for kind, caption in captions.items():
-        for path in sorted((run / "pictures").glob(f"*_{kind}.png"))[:1]:
-            figures += f"<figure>{inline_image(path, caption, width_px=720)}<figcaption>{caption}</figcaption></figure>"
-    return f'<div class="row">{figures}</div>'
+def _name(row: Row) -> str:
+    name = escape(f"{row['labeller']}, {row['preset']}")
+    return f'<a href="{escape(str(row["run"]))}/report.html">{name}</a>'
+
+
+def _score_text(value: object) -> str:
+    if not isinstance(value, float):
+        return value_text(value)
+    return f"{value:.3f}" if value < 10 else value_text(round(value))
 
 
 def _truth(out: Path, run: Path, truth: Path) -> str:
     """The orthomosaic where the map lies, without and with its labels, as files of their own and in the page."""
-    with rasterio.open(run / "bev.tif") as bev:
-        bounds = bev.bounds
-    window = {name: _cut(truth / name, bounds) for name in ("orthomosaic.tif", "orthomosaic_labels.tif")}
-    image, codes = np.moveaxis(window["orthomosaic.tif"], 0, -1), window["orthomosaic_labels.tif"][0]
+    with rasterio.open(run / "bev.tif") as raster:
+        bounds = raster.bounds
+    image = np.moveaxis(_cut(truth / "orthomosaic.tif", bounds), 0, -1)
+    codes = _cut(truth / "orthomosaic_labels.tif", bounds)[0]
     labels = np.where(codes == 0, IGNORE, codes).astype(np.uint8)
     pictures = {
-        "orthomosaic": ("Orthomosaic, under another sun", image),
+        "orthomosaic": ("Orthomosaic, at another time of day", image),
         "truth": ("Ground truth", overlay_labels(image, labels, ROVER_CLASSES)),
     }
     figures = ""
     for name, (caption, picture) in pictures.items():
-        path = out / f"{name}.png"
-        with atomic_path(path) as temporary:
+        with atomic_path(out / f"{name}.png") as temporary:
             Image.fromarray(picture).save(temporary)
-        figures += f"<figure>{inline_image(path, caption, width_px=720)}<figcaption>{caption}</figcaption></figure>"
+        figures += figure(inline_image(out / f"{name}.png", caption, width_px=_WIDTH_PX), caption)
     return f'<div class="row">{figures}</div>'
 
 
@@ -97,30 +104,16 @@ def _cut(path: Path, bounds: BoundingBox) -> np.ndarray:
             part = from_bounds(*bounds, transform=file.transform).round_offsets().round_lengths()
             return file.read(window=part.intersection(whole.round_offsets().round_lengths()))
     except RasterioError as error:
-        raise JaxmapError("not a readable raster", where=path, fix="install jaxmap anew") from error
+        raise JaxmapError("not a readable raster", where=path, fix="reinstall jaxmap") from error
 
 
-def _pictures(out: Path, rows: Sequence[Row], file: str, kind: str) -> str:
-    figures = ""
-    for row in rows:
-        name, caption = str(row["run"]), f"{row['labeller']}, {row['preset']}"
-        image = inline_image(out / name / file, f"{kind}: {caption}", width_px=720)
-        link = f'<a href="{escape(name)}/report.html">{escape(caption)}</a>'
-        figures += f'<figure><div class="paper">{image}</div><figcaption>{link}</figcaption></figure>'
-    return f'<div class="row">{figures}</div>'
-
-
-def _table(columns: Mapping[str, str], rows: Sequence[Row]) -> str:
-    head = "".join(f'<th scope="col"{_alignment(rows[0][key])}>{escape(name)}</th>' for key, name in columns.items())
-    body = "".join(
-        "<tr>" + "".join(f"<td{_alignment(row[key])}>{value_text(row[key])}</td>" for key in columns) + "</tr>"
-        for row in rows
+def _map_and_errors(out: Path, row: Row) -> str:
+    name = f"{row['labeller']}, {row['preset']}"
+    images = (
+        inline_image(out / str(row["run"]) / file, f"{kind}: {name}", width_px=_WIDTH_PX)
+        for file, kind in (("bev.png", "Top-down map"), ("errors.png", "Errors"))
     )
+    figures = "".join(f'<figure><div class="paper">{image}</div></figure>' for image in images)
     return (
-        '<div class="tables"><figure class="wide"><table class="barred">'
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></figure></div>"
+        f'<div class="frame"><h3>{_name(row)}: IoU {_score_text(row["iou"])}</h3><div class="row">{figures}</div></div>'
     )
-
-
-def _alignment(value: object) -> str:
-    return ' class="text"' if isinstance(value, str) else ""

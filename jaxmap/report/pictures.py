@@ -1,4 +1,4 @@
-"""The pictures of a run: disparity and labels of its frames in colour, and the plan of its map."""
+"""Disparity and labels of a frame in colour."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxmap.labels import IGNORE, class_colours
-from jaxmap.report.plan import top_down_picture
-
-__all__ = ["colourise_disparity", "colourise_labels", "overlay_labels", "top_down_picture"]
 
 NO_DISPARITY_COLOUR = (22, 24, 29)
 
@@ -33,18 +30,12 @@ def colourise_disparity(disparity_px: Float[np.ndarray, "H W"]) -> UInt8[np.ndar
     return picture
 
 
-def colourise_labels(labels: UInt8[np.ndarray, "H W"], classes: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:
-    """Labels in the colours of their classes; grey where there is none."""
-    return class_colours(classes)[np.asarray(labels)]
-
-
 def overlay_labels(
     image: UInt8[np.ndarray, "H W *rgb"], labels: UInt8[np.ndarray, "H W"], classes: Sequence[str], alpha: float = 0.45
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A grey or RGB image tinted by its labels, by `alpha` of their colour; the others stay as they are."""
+    """A grey or RGB image tinted by `alpha` of the colours of its labels; pixels without a label stay as they are."""
     image = np.asarray(image, np.float64)
     if image.ndim == 2:
         image = image[..., None]
     share = np.where(np.asarray(labels) == IGNORE, 0.0, alpha)[..., None]
-    mixed = (1 - share) * image + share * colourise_labels(labels, classes)
-    return np.rint(mixed).astype(np.uint8)
+    return np.rint((1 - share) * image + share * class_colours(classes)[np.asarray(labels)]).astype(np.uint8)

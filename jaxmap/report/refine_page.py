@@ -13,8 +13,7 @@ from jaxmap.host.files import atomic_path
 from jaxmap.refinement.consistency import Consistency
 from jaxmap.refinement.rounds import Refinement
 from jaxmap.report.charts import Chart, Mark, Series, line_chart
-from jaxmap.report.inline import inline_image
-from jaxmap.report.page import page
+from jaxmap.report.page import inline_image, page
 from jaxmap.report.wording import number_text
 
 SPREAD, TRAJECTORY = "consistency.png", "trajectory.png"

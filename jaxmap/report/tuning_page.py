@@ -1,17 +1,32 @@
-"""The page of a tuning: what the numbers were and became, what that did to scores and calibration, and how it went."""
+"""The page of a tuning: parameters, scores and calibration before and after, and the course of the loss."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
-from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxmap.report.charts import Chart, Mark, Series, line_chart
-from jaxmap.report.page import page
+from jaxmap.report.page import (
+    ACCENT,
+    BAR,
+    INK,
+    LINE,
+    QUIET,
+    figure,
+    header,
+    notes_section,
+    page,
+    section,
+    svg_of,
+    table,
+)
 from jaxmap.report.wording import number_text, value_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Stage = Mapping[str, Any]
 """One descent: `name best_step history scores calibration parameters`, as the JSON of `jaxmap tune` has it."""
@@ -35,108 +50,97 @@ def tuning_page(title: str, result: Mapping[str, Any]) -> str:
         title: its heading.
         result: what `jaxmap tune` writes into its JSON.
     """
-    style = files("jaxmap.report").joinpath("training_page.css").read_text(encoding="utf-8")
-    sections = [
-        f"<style>{style}</style>",
-        _header(title, result),
-        *(_stage(stage) for stage in result["stages"]),
-        _parameters(result),
-        _traverses(result["traverses"]),
-        _notes(result["notes"]),
+    stages, scores = result["stages"], result["stages"][-1]["scores"]["held_out"]
+    stats = [
+        (f"{name}, held out", f"{_text(scores[key]['before'])} → {_text(scores[key]['after'])}")
+        for key, name in (("iou", "IoU"), ("ece", "calibration error"), ("nll", "NLL"))
+    ]
+    columns = [result["before"], *(stage["parameters"] for stage in stages)]
+    names = dict.fromkeys(name for column in columns for name in column)
+    parameters = [
+        (escape(name.replace("_", " ")), *(_numbers_text(column.get(name)) for column in columns)) for name in names
+    ]
+    traverses = [
+        (escape(one["sequence"]), *(value_text(one[key]) for key in ("frames", "cells", "held_out_cells")))
+        for one in result["traverses"]
+    ]
+    body = [
+        header("Tuning of fusion", title, f"{result['class']}, labels: {result['labeller']}", stats),
+        *map(_stage, stages),
+        section("Parameters", _listed(("", "before", *(escape(stage["name"]) for stage in stages)), parameters)),
+        section("Traverses", _listed(("Sequence", "frames", "cells", "held out"), traverses)),
+        notes_section(result["notes"]),
         "<footer>Made by jaxmap.</footer>",
     ]
-    return page(title, "".join(sections), drawn=False)
+    return page(title, "".join(body), drawn=False)
 
 
-def _header(title: str, result: Mapping[str, Any]) -> str:
-    scores = result["stages"][-1]["scores"]["held_out"]
-    stats = "".join(
-        f"<div><dt>{name}, held out</dt><dd>{_text(scores[key]['before'])} → {_text(scores[key]['after'])}</dd></div>"
-        for key, name in (("iou", "IoU"), ("ece", "calibration error"), ("nll", "NLL"))
-    )
-    line = escape(f"{result['class']}, labels: {result['labeller']}")
-    return (
-        f'<header><p class="kind">Tuning of fusion</p><h1>{escape(title)}</h1><p>{line}</p>'
-        f'<dl class="stats">{stats}</dl></header>'
-    )
+def _listed(headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    return f'<div class="list">{table(headings, rows, "plain")}</div>'
 
 
 def _stage(stage: Stage) -> str:
-    tables = "".join(_score_table(name, stage["scores"][part]) for part, name in _PARTS.items())
-    charts = [
-        ("Loss", _losses(stage)),
-        *((f"Calibration, {_PARTS[part].lower()}", _calibration(stage, part)) for part in _PARTS),
-    ]
-    figures = "".join(f"<figure><figcaption>{name}</figcaption>{chart}</figure>" for name, chart in charts if chart)
-    return (
-        f'<section><h2>{escape(stage["name"].capitalize())}</h2><div class="tables">{tables}</div>'
-        f"<p>In brackets the middle nine tenths of 1,000 draws of whole rocks and blocks of ground.</p>"
-        f'<div class="charts">{figures}</div></section>'
+    tables = ""
+    for part, title in _PARTS.items():
+        scores = stage["scores"][part]
+        rows = [
+            (name, *(_interval_text(scores[key], when) for when in ("before", "after", "change")))
+            for key, name in _SCORES.items()
+        ]
+        tables += figure(table(("", "before", "after", "change"), rows), title)
+    charts = figure(_losses(stage), "Loss") + "".join(
+        figure(_calibration(stage["calibration"][part]), f"Calibration, {title.lower()}")
+        for part, title in _PARTS.items()
+    )
+    return section(
+        escape(stage["name"].capitalize()),
+        f'<div class="tables">{tables}</div>'
+        "<p>In brackets the middle nine tenths of 1,000 bootstrap samples of whole rocks and blocks of ground.</p>"
+        f'<div class="charts">{charts}</div>',
     )
 
 
-def _score_table(title: str, scores: Mapping[str, Any]) -> str:
-    body = "".join(
-        f'<tr><th scope="row">{name}</th>'
-        + "".join(f"<td>{_interval_text(scores[key], when)}</td>" for when in ("before", "after", "change"))
-        + "</tr>"
-        for key, name in _SCORES.items()
-    )
-    head = "".join(f'<th scope="col">{name}</th>' for name in ("", "before", "after", "change"))
-    table = f'<table class="barred"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-    return f"<figure><figcaption>{title}</figcaption>{table}</figure>"
+def _chart(x_name: str, y_name: str) -> tuple[Figure, Axes]:
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(5.2, 3.1), layout="constrained")
+    axes = drawing.add_subplot()
+    axes.set_xlabel(x_name, color=QUIET)
+    axes.set_ylabel(y_name, color=QUIET)
+    axes.tick_params(color=LINE, labelcolor=QUIET)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(LINE)
+    axes.grid(axis="y", color=LINE)
+    return drawing, axes
+
+
+def _losses(stage: Stage) -> str:
+    history = stage["history"]
+    steps, best = [row["step"] for row in history], stage["best_step"]
+    drawing, axes = _chart("step", "loss")
+    axes.plot(steps, [row["loss"] for row in history], color=QUIET, label="tuned on")
+    axes.plot(steps, [row["held_out"] for row in history], color=ACCENT, linewidth=2.4, label="held out")
+    axes.axvline(best, color=QUIET, linestyle=":", linewidth=1, label=f"kept, step {best}")
+    axes.legend(frameon=False, labelcolor=INK)
+    return svg_of(drawing, "Loss by step")
+
+
+def _calibration(bins: Mapping[str, Any]) -> str:
+    drawing, axes = _chart("predicted probability", "observed share")
+    axes.plot([0, 1], [0, 1], color=QUIET, linestyle=":", linewidth=1, label="ideal")
+    looks: dict[str, Any] = {"before": dict(color=BAR), "after": dict(color=ACCENT, linewidth=2.4)}
+    for when, look in looks.items():
+        points = sorted((row["said"], row["true"]) for row in bins[when])
+        axes.plot(*zip(*points, strict=True) if points else ((), ()), marker="o", markersize=3.5, label=when, **look)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    axes.legend(frameon=False, labelcolor=INK)
+    return svg_of(drawing, "How often cells are of the class, by the probability that the map gives them")
 
 
 def _interval_text(row: Mapping[str, Any], when: str) -> str:
     interval = row[f"{when}_interval"]
     around = f" ({_text(interval[0])} to {_text(interval[1])})" if interval else ""
     return _text(row[when]) + around
-
-
-def _losses(stage: Stage) -> str:
-    history = stage["history"]
-    series = [
-        Series("held out", [(row["step"], row["held_out"]) for row in history], "var(--accent)", strong=True),
-        Series("tuned on", [(row["step"], row["loss"]) for row in history], "var(--quiet)"),
-    ]
-    return line_chart(Chart("Loss by step", "step", "loss", mark=Mark(stage["best_step"], "kept")), series)
-
-
-def _calibration(stage: Stage, part: str) -> str:
-    bins = stage["calibration"][part]
-
-    def points(when: str) -> list[tuple[float, float]]:
-        return sorted((row["said"], row["true"]) for row in bins[when])
-
-    series = [
-        Series("ideal", [(0.0, 0.0), (1.0, 1.0)], "var(--quiet)"),
-        Series("before", points("before"), "var(--bar)"),
-        Series("after", points("after"), "var(--accent)", strong=True),
-    ]
-    chart = Chart(
-        "How often cells are of the class, by the probability that the map gives them",
-        "probability said",
-        "share true",
-        x_range=(0, 1),
-        y_range=(0, 1),
-    )
-    return line_chart(chart, series)
-
-
-def _parameters(result: Mapping[str, Any]) -> str:
-    columns = [result["before"], *(stage["parameters"] for stage in result["stages"])]
-    head = "".join(
-        f'<th scope="col">{escape(name)}</th>' for name in ("", "before", *(s["name"] for s in result["stages"]))
-    )
-    names = dict.fromkeys(name for column in columns for name in column)
-    body = "".join(
-        f'<tr><th scope="row">{escape(name.replace("_", " "))}</th>'
-        + "".join(f"<td>{_numbers_text(column.get(name))}</td>" for column in columns)
-        + "</tr>"
-        for name in names
-    )
-    table = f'<div class="list"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    return f"<section><h2>Numbers</h2>{table}</section>"
 
 
 def _numbers_text(value: Any) -> str:
@@ -147,23 +151,6 @@ def _numbers_text(value: Any) -> str:
     if array.ndim > 1:
         return "<br>".join(_numbers_text(row) for row in array)
     return " ".join(number_text(float(f"{number:.3g}")) for number in array.ravel())
-
-
-def _traverses(traverses: Sequence[Mapping[str, Any]]) -> str:
-    rows = "".join(
-        f'<tr><th scope="row">{escape(one["sequence"])}</th>'
-        + "".join(f"<td>{value_text(one[key])}</td>" for key in ("frames", "cells", "held_out_cells"))
-        + "</tr>"
-        for one in traverses
-    )
-    head = "".join(f'<th scope="col">{name}</th>' for name in ("Sequence", "frames", "cells", "held out"))
-    table = f'<div class="list"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
-    return f"<section><h2>Traverses</h2>{table}</section>"
-
-
-def _notes(notes: Sequence[str]) -> str:
-    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    return f"<section><h2>Notes</h2><ul>{items}</ul></section>" if items else ""
 
 
 def _text(value: float | None) -> str:

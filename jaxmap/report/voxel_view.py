@@ -1,4 +1,4 @@
-"""Occupied voxels as a 3D figure to turn around."""
+"""Occupied voxels as a 3D figure to turn around: their visible faces, of coarser voxels where there are too many."""
 
 from __future__ import annotations
 
@@ -6,17 +6,67 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.labels import IGNORE, class_colours
-from jaxmap.report.faces import Faces, exposed_faces, merge_voxels
+from jaxmap.report.wording import value_text
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 MAX_FACES = 40_000
-HEIGHT_COLOURS = "Viridis"
+
+# The corners of a face, for each axis it can be normal to, counter-clockwise.
+_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+class Faces(NamedTuple):
+    """Square faces of voxels: corners on the voxel grid, two triangles for each face, and the voxel it belongs to."""
+
+    corner: Int[np.ndarray, "P 3"]
+    triangle: Int[np.ndarray, "2F 3"]
+    voxel: Int[np.ndarray, "F"]
+
+
+def exposed_faces(index: Int[np.ndarray, "N 3"], *, undersides: bool = True) -> Faces:
+    """The faces between a voxel of `index` (each given once) and a neighbour that is not in it."""
+    index = np.asarray(index, np.int64).reshape(-1, 3)
+    low = index.min(axis=0, initial=np.iinfo(np.int32).max) - 1
+    local = index - low
+    solid = np.zeros(local.max(axis=0, initial=0) + 2, bool)
+    solid[tuple(local.T)] = True
+    corners, voxels = [], []
+    for axis in range(3):
+        for side in (0, 1):
+            if (axis, side) == (2, 0) and not undersides:
+                continue
+            step = (2 * side - 1) * np.eye(3, dtype=np.int64)[axis]
+            voxel = np.flatnonzero(~solid[tuple((local + step).T)])
+            square = np.insert(_SQUARE, axis, side, axis=1)
+            # Seen from outside, corners go round counter-clockwise (y is the one axis whose plane is left-handed).
+            square = square if (side == 1) != (axis == 1) else square[::-1]
+            corners.append((local[voxel, None] + square[None]).reshape(-1, 3))
+            voxels.append(voxel)
+    keys = np.ravel_multi_index(tuple(np.concatenate(corners).T), solid.shape)
+    shared, quads = np.unique(keys, return_inverse=True)
+    return Faces(
+        corner=(np.stack(np.unravel_index(shared, solid.shape), axis=-1) + low).astype(np.int32),
+        triangle=quads.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).astype(np.int32),
+        voxel=np.concatenate(voxels).astype(np.int32),
+    )
+
+
+def merge_voxels(
+    index: Int[np.ndarray, "N 3"], label: UInt8[np.ndarray, "N"]
+) -> tuple[Int[np.ndarray, "M 3"], UInt8[np.ndarray, "M"]]:
+    """Merges 2 x 2 x 2 voxels into one, with the label of most of them (the lowest among equals)."""
+    parents, place = np.unique(np.asarray(index, np.int64) // 2, axis=0, return_inverse=True)
+    pairs, counts = np.unique(place.ravel() * 256 + label, return_counts=True)
+    # Sorted by parent, then by falling count: the first of each parent wins.
+    order = np.lexsort((pairs, -counts, pairs // 256))
+    first = order[np.unique(pairs[order] // 256, return_index=True)[1]]
+    return parents.astype(np.int32), (pairs[first] % 256).astype(np.uint8)
 
 
 class VoxelView(NamedTuple):
@@ -24,17 +74,6 @@ class VoxelView(NamedTuple):
 
     figure: Figure
     caption: str
-
-
-class _Shape(NamedTuple):
-    """What is drawn: the faces of voxels of `size_m`, and a label for each voxel."""
-
-    faces: Faces
-    label: UInt8[np.ndarray, "N"]
-    centre_z_m: Float[np.ndarray, "N"]
-    corners_world: Float[np.ndarray, "P 3"]
-    size_m: Float[np.ndarray, "3"]
-    merged: int
 
 
 def voxel_view(
@@ -46,49 +85,9 @@ def voxel_view(
     """
     from plotly.graph_objects import Figure
 
-    shape = _shape(voxels)
-    path_world = np.zeros((0, 3)) if trajectory_world is None else np.asarray(trajectory_world, np.float64)
-    path_world = path_world[np.isfinite(path_world).all(axis=-1)]
-    figure = Figure()
-    by_class, by_height = _colourings(shape, classes)
-    start = by_class if by_class else by_height
-    if len(shape.label):
-        figure.add_mesh3d(
-            **{axis: shape.corners_world[:, i] for i, axis in enumerate("xyz")},
-            **{corner: shape.faces.triangle[:, i] for i, corner in enumerate("ijk")},
-            **start,
-            intensitymode="cell",
-            flatshading=True,
-            # Without an epsilon of 0 plotly takes faces as small as these for degenerate, and leaves them unlit.
-            lighting=dict(
-                ambient=0.55,
-                diffuse=0.6,
-                specular=0.03,
-                roughness=0.9,
-                fresnel=0.0,
-                facenormalsepsilon=0,
-                vertexnormalsepsilon=0,
-            ),
-            lightposition=dict(x=-6e4, y=-2e4, z=1e5),
-            hovertemplate="east %{x:.1f} m, north %{y:.1f} m, height %{z:.1f} m<extra></extra>",
-            name="voxels",
-        )
-    _add_path(figure, path_world)
-    points_world = np.concatenate([shape.corners_world.astype(np.float64), path_world])
-    figure.update_layout(
-        scene=_scene(points_world),
-        margin=dict(l=0, r=0, t=0, b=0),
-        paper_bgcolor="rgba(0,0,0,0)",
-        showlegend=False,
-        updatemenus=[_buttons(by_class, by_height)] if by_class and len(shape.label) else [],
-    )
-    return VoxelView(figure, _caption(voxels, shape))
-
-
-def _shape(voxels: OccupiedVoxels) -> _Shape:
     size_m = np.asarray(voxels.voxel_size_m, np.float64)
     index, label, merged = voxels.index, voxels.label, 1
-    # The corner of voxel (0, 0, 0), told from the centre of the first voxel there is.
+    # The corner of voxel (0, 0, 0), from the centre of the first voxel there is.
     origin_m = np.zeros(3)
     if len(index):
         origin_m = voxels.centres_world[0].astype(np.float64) - (index[0] + 0.5) * size_m
@@ -97,46 +96,71 @@ def _shape(voxels: OccupiedVoxels) -> _Shape:
         index, label = merge_voxels(index, label)
         size_m, merged = size_m * 2, merged * 2
         faces = exposed_faces(index, undersides=False)
-    return _Shape(
-        faces=faces,
-        label=label,
-        centre_z_m=origin_m[2] + (index[:, 2] + 0.5) * size_m[2],
-        corners_world=(origin_m + faces.corner * size_m).astype(np.float32),
-        size_m=size_m,
-        merged=merged,
+    corners_world = (origin_m + faces.corner * size_m).astype(np.float32)
+    path_world = np.zeros((0, 3)) if trajectory_world is None else np.asarray(trajectory_world, np.float64)
+    path_world = path_world[np.isfinite(path_world).all(axis=-1)]
+
+    figure, buttons = Figure(), []
+    if len(label):
+        face_voxel = np.repeat(faces.voxel, 2)
+        by_class = _class_colours(label, face_voxel, classes)
+        by_height = _height_colours((origin_m[2] + (index[:, 2] + 0.5) * size_m[2])[face_voxel].astype(np.float32))
+        buttons = [_buttons(by_class, by_height)] if by_class else []
+        figure.add_mesh3d(
+            **{axis: corners_world[:, i] for i, axis in enumerate("xyz")},
+            **{corner: faces.triangle[:, i] for i, corner in enumerate("ijk")},
+            **(by_class or by_height),
+            intensitymode="cell",
+            flatshading=True,
+            # Without an epsilon of 0 plotly takes faces as small as these for degenerate, and leaves them unlit.
+            lighting=dict(ambient=0.55, diffuse=0.6, specular=0.03, roughness=0.9, fresnel=0.0)
+            | dict(facenormalsepsilon=0, vertexnormalsepsilon=0),
+            lightposition=dict(x=-6e4, y=-2e4, z=1e5),
+            hovertemplate="east %{x:.1f} m, north %{y:.1f} m, height %{z:.1f} m<extra></extra>",
+            name="voxels",
+        )
+    _add_path(figure, path_world)
+    figure.update_layout(
+        scene=_scene(np.concatenate([corners_world.astype(np.float64), path_world])),
+        margin=dict(l=0, r=0, t=0, b=0),
+        paper_bgcolor="rgba(0,0,0,0)",
+        showlegend=False,
+        updatemenus=buttons,
     )
+    size = " × ".join(f"{edge_m:g}" for edge_m in size_m.astype(np.float32).tolist())
+    caption = f"{value_text(len(voxels.label))} occupied voxels of {size} m."
+    if merged > 1:
+        caption = (
+            f"{value_text(len(voxels.label))} occupied voxels, drawn as {value_text(len(label))} of {size} m: "
+            f"{merged} × {merged} × {merged} voxels merged into one, with the label of most of them."
+        )
+    return VoxelView(figure, caption)
 
 
-def _colourings(shape: _Shape, classes: Sequence[str]) -> tuple[dict[str, Any] | None, dict[str, Any]]:
-    """The mesh's colours by class (none where no voxel has one) and by height."""
-    face_voxel = np.repeat(shape.faces.voxel, 2)
-    bar = dict(thickness=10, len=0.55, x=1.0, xanchor="right", y=0.5, outlinewidth=0)
-    z_m = shape.centre_z_m[face_voxel].astype(np.float32)
-    low, high = np.percentile(z_m, [1, 99]).tolist() if len(z_m) else (0.0, 1.0)
-    by_height = dict(
-        intensity=z_m,
-        colorscale=HEIGHT_COLOURS,
-        cmin=low,
-        cmax=max(high, low + 1e-3),
-        colorbar=dict(bar, title=dict(text="height, m")),
-    )
-    present = np.unique(shape.label)
+_BAR: dict[str, Any] = dict(thickness=10, len=0.55, x=1.0, xanchor="right", y=0.5, outlinewidth=0)
+
+
+def _height_colours(z_m: Float[np.ndarray, "F"]) -> dict[str, Any]:
+    low, high = np.percentile(z_m, [1, 99]).tolist()
+    look = dict(colorscale="Viridis", cmin=low, cmax=max(high, low + 1e-3))
+    return dict(look, intensity=z_m, colorbar=dict(_BAR, title=dict(text="height, m")))
+
+
+def _class_colours(label: np.ndarray, face_voxel: np.ndarray, classes: Sequence[str]) -> dict[str, Any] | None:
+    """Colours by class; None where no voxel has one."""
+    present = np.unique(label)
     if (present == IGNORE).all():
-        return None, by_height
+        return None
     colours = [f"rgb({r},{g},{b})" for r, g, b in class_colours(classes)[present].tolist()]
     steps = np.linspace(0, 1, len(present) + 1).tolist()
+    names = ["no label" if index == IGNORE else classes[index] for index in present.tolist()]
     return dict(
-        intensity=np.searchsorted(present, shape.label)[face_voxel].astype(np.uint8),
+        intensity=np.searchsorted(present, label)[face_voxel].astype(np.uint8),
         colorscale=[[edge, colour] for i, colour in enumerate(colours) for edge in steps[i : i + 2]],
         cmin=-0.5,
         cmax=len(present) - 0.5,
-        colorbar=dict(
-            bar,
-            title=dict(text=""),
-            tickvals=list(range(len(present))),
-            ticktext=["no label" if label == IGNORE else classes[label] for label in present.tolist()],
-        ),
-    ), by_height
+        colorbar=dict(_BAR, title=dict(text=""), tickvals=list(range(len(present))), ticktext=names),
+    )
 
 
 def _buttons(by_class: dict[str, Any], by_height: dict[str, Any]) -> dict[str, Any]:
@@ -180,7 +204,7 @@ def _scene(points_world: Float[np.ndarray, "N 3"]) -> dict[str, Any]:
     span_m = np.maximum(high - low, 1e-2)
     longest_m = span_m[:2].max()
     turn = np.deg2rad(-66.0 if span_m[0] >= span_m[1] else -24.0)
-    slant, distance = np.deg2rad(40.0), 1.65
+    slant, distance = np.deg2rad(40.0), 1.9
     across = np.array([np.cos(turn), np.sin(turn), 0.0])
     # What is near looks larger: looking a little before the middle fills the view evenly.
     centre = 0.16 * across
@@ -200,17 +224,3 @@ def _scene(points_world: Float[np.ndarray, "N 3"]) -> dict[str, Any]:
         dragmode="orbit",
         domain=dict(x=[0.0, 0.92]),
     )
-
-
-def _caption(voxels: OccupiedVoxels, shape: _Shape) -> str:
-    size = " × ".join(f"{size_m:g}" for size_m in shape.size_m.astype(np.float32).tolist())
-    if shape.merged == 1:
-        return f"{_count(voxels.label)} occupied voxels of {size} m."
-    return (
-        f"{_count(voxels.label)} occupied voxels, drawn as {_count(shape.label)} of {size} m: "
-        f"{shape.merged} × {shape.merged} × {shape.merged} voxels merged into one, with the label of most of them."
-    )
-
-
-def _count(values: np.ndarray) -> str:
-    return f"{len(values):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")

@@ -20,9 +20,10 @@ from jaxmap.datasets.rasters import read_picture
 from jaxmap.datasets.rock_list import DEFAULT_DIAMETERS_M, draw_rocks, find_rock_lists, read_rock_lists
 from jaxmap.ensemble.layer import stored_layers
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.evaluation.evaluate import ClassMap, Evaluation, ScoringOptions, evaluate_map
-from jaxmap.evaluation.truth_cells import PixelCorners, pixel_corners, sample_between
-from jaxmap.evaluation.views import Views
+from jaxmap.evaluation.camera_track import CameraTrack
+from jaxmap.evaluation.evaluate import ClassLayer, Evaluation, evaluate_map
+from jaxmap.evaluation.options import ScoringOptions
+from jaxmap.evaluation.truth_cells import pixel_corners, sample_between
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import top_down
@@ -53,8 +54,8 @@ class TruthOptions:
     diameters_m: Mapping[str, float] | None = None
 
 
-def read_class_map(run: Path, target: str) -> ClassMap:
-    """The map of a run as `target` is scored in it.
+def read_class_layer(run: Path, target: str) -> ClassLayer:
+    """The class `target` of a run's map, as it is scored.
 
     Raises:
         JaxmapError: there is no map, or it is damaged.
@@ -68,14 +69,14 @@ def read_class_map(run: Path, target: str) -> ClassMap:
         known = f"its classes are {' '.join(voxel_map.classes)}" if voxel_map.classes else "it has no class at all"
         raise UsageError(f"the map has no class {target!r}: {known}", where=folder.map, fix="name one with --class")
     params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
-    class_map = class_map_of(
+    layer = class_layer_of(
         voxel_map, params, rule, target, site_origin=np.asarray(attributes.site_origin, np.float64), crs=attributes.crs
     )
     ensemble = stored_layers(attributes.layers, target, folder.map)
-    return class_map if ensemble is None else replace(class_map, ensemble=np.asarray(ensemble.probability))
+    return layer if ensemble is None else replace(layer, ensemble=np.asarray(ensemble.probability))
 
 
-def class_map_of(
+def class_layer_of(
     voxel_map: VoxelMap,
     params: FusionParams,
     rule: FusionRule,
@@ -83,20 +84,20 @@ def class_map_of(
     *,
     site_origin: Float64[np.ndarray, "3"],
     crs: str | None,
-) -> ClassMap:
-    """A map from above, as `target`, one of its classes, is scored in it.
+) -> ClassLayer:
+    """One class of a map, as it is scored.
 
     Args:
         voxel_map: the map.
-        params: how its evidence is read, with `rule`.
-        rule: see `params`.
+        params: of fusion, by which the evidence is read.
+        rule: of fusion, likewise.
         target: name of the class.
         site_origin: where the origin of the map's world lies in `crs`, metres.
         crs: coordinate reference system of the site, or None.
     """
     top = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
     index = voxel_map.classes.index(target)
-    return ClassMap(
+    return ClassLayer(
         grid=voxel_map.grid,
         is_class=(top.label == index) & top.observed,
         probability=top.probability[index],
@@ -108,11 +109,11 @@ def class_map_of(
     )
 
 
-def read_views(run: Path, site_origin: np.ndarray) -> tuple[Views | None, str]:
+def read_cameras(run: Path, site_origin: np.ndarray) -> tuple[CameraTrack | None, str]:
     """The cameras of a run from its poses.tum and metrics.json; None, and why, where they cannot be read.
 
-    The poses are those of the images as they were stored: where jaxmap has rectified them, the view is off by the
-    rectifying turn, fractions of a degree for a usual rig.
+    The poses are those of the images as they were stored: where jaxmap rectified them, the view is off by the
+    rectifying rotation, fractions of a degree for a usual rig.
     """
     folder = RunFolder(run)
     try:
@@ -122,7 +123,7 @@ def read_views(run: Path, site_origin: np.ndarray) -> tuple[Views | None, str]:
         T_world_camera = track.T.copy()
         T_world_camera[:, :3, 3] -= site_origin
         numbers = {name: float(camera[f"{name}_px"]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-        views = Views(
+        cameras = CameraTrack(
             T_world_camera,
             (numbers["fx"], numbers["fy"]),
             (numbers["cx"], numbers["cy"]),
@@ -135,7 +136,7 @@ def read_views(run: Path, site_origin: np.ndarray) -> tuple[Views | None, str]:
             None,
             f"the cameras' view is not known ({reason}): every labelled cell of the map counts as in view",
         )
-    return views, ""
+    return cameras, ""
 
 
 def read_truth(sources: Sequence[Path], place: Extent, options: TruthOptions) -> LabelRaster:
@@ -166,35 +167,35 @@ def read_truth(sources: Sequence[Path], place: Extent, options: TruthOptions) ->
 
 def evaluate_run(
     run: Path, sources: Sequence[Path], truth_options: TruthOptions, options: ScoringOptions
-) -> tuple[Evaluation, ClassMap]:
-    """Scores the map of a run; `scores` tells all that they rest on.
+) -> tuple[Evaluation, ClassLayer]:
+    """Scores the map of a run; `scores` records all that they rest on.
 
     Raises:
         JaxmapError: map or truth cannot be read, or do not lie over each other.
     """
-    class_map = read_class_map(run, truth_options.target)
-    views, remark = read_views(run, class_map.site_origin)
-    if views is None and options.max_range_m is not None:
+    layer = read_class_layer(run, truth_options.target)
+    cameras, remark = read_cameras(run, layer.site_origin)
+    if cameras is None and options.max_range_m is not None:
         raise JaxmapError(
             f"--max-range-m needs poses.tum and metrics.json of the run: {remark}", where=run, fix="map again"
         )
-    raster = read_truth(sources, class_map.place, truth_options)
-    evaluation = evaluate_map(class_map, raster, views, options)
+    raster = read_truth(sources, layer.place, truth_options)
+    evaluation = evaluate_map(layer, raster, cameras, options)
     evaluation.scores.update(
         {
             "class": truth_options.target,
             "run": str(run),
             "ground_truth": [str(source) for source in sources],
-            "crs": crs_text(class_map.crs or raster.crs) if class_map.crs or raster.crs else None,
+            "crs": crs_text(layer.crs or raster.crs) if layer.crs or raster.crs else None,
             "notes": [*raster.notes, *([remark] if remark else [])],
             "jaxmap_version": jaxmap.__version__,
         }
     )
-    return evaluation, class_map
+    return evaluation, layer
 
 
 def write_evaluation(
-    out: Path, picture: Path, evaluation: Evaluation, class_map: ClassMap, backdrop: Path | None
+    out: Path, picture: Path, evaluation: Evaluation, layer: ClassLayer, backdrop: Path | None
 ) -> None:
     """Writes the scores as JSON and the error map as PNG.
 
@@ -203,18 +204,12 @@ def write_evaluation(
     """
     image = None
     if backdrop is not None:
-        image = _backdrop(backdrop, evaluation, class_map)
+        # On the cells of the evaluation, moved as the truth was.
+        pixels, T_crs_pixel, crs = read_picture(backdrop, layer.place)
+        place = (evaluation.cells, layer.site_origin, layer.crs, evaluation.alignment)
+        image = sample_between(pixels, pixel_corners(T_crs_pixel, crs, *place), _BACKDROP_SAMPLES)
     write_error_map(picture, evaluation, image)
     write_json(out, evaluation.scores)
-
-
-def _backdrop(path: Path, evaluation: Evaluation, class_map: ClassMap) -> np.ndarray:
-    """An orthomosaic on the cells of the evaluation: uint8 (I n, J n, 3), moved as the truth was."""
-    pixels, T_crs_pixel, crs = read_picture(path, class_map.place)
-    corners: PixelCorners = pixel_corners(
-        T_crs_pixel, crs, evaluation.cells, class_map.site_origin, class_map.crs, evaluation.alignment
-    )
-    return sample_between(pixels, corners, _BACKDROP_SAMPLES)
 
 
 def summary(scores: dict[str, Any]) -> str:

@@ -1,10 +1,10 @@
-"""What a run writes beside its map: pictures, PLY, GeoTIFF, poses."""
+"""The folder of a mapping run: its files, and what is written beside the map: pictures, PLY, GeoTIFF, poses."""
 
 from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,9 @@ from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_lab
 from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.mapping.store import MapAttributes, holds_map, load_map
-from jaxmap.report.missed_plan import missed_picture
-from jaxmap.report.pictures import colourise_disparity, overlay_labels, top_down_picture
-from jaxmap.runs.config import MapConfig, config_tree
+from jaxmap.report.pictures import colourise_disparity, overlay_labels
+from jaxmap.report.top_down import missed_picture, top_down_picture
 from jaxmap.runs.log import RunLog
-from jaxmap.runs.mapping_plan import Plan
 from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.types import VoxelMap
 
@@ -59,27 +57,26 @@ class RunFolder:
         """Keeps other runs out of the folder, see `output_folder.locked`."""
         return locked(self.path)
 
-    def begin(self, plan: Plan, config: MapConfig, *, resume: bool, overwrite: bool) -> None:
-        """Writes the resolved configuration, or checks that a run can go on.
+    def begin(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> None:
+        """Writes the resolved settings (`Plan.settings`), or checks that the run here can be resumed with them.
 
         Raises:
             JaxmapError: the folder holds a run already, or files of the same names that are no run's.
             UsageError: the run to be resumed had other settings.
         """
-        tree = {"sequence": plan.source, **config_tree(config), **plan.resolved}
         # A run that has failed before its first save has left nothing to lose.
         used = holds_map(self.map) or self.metrics.exists()
         if used and resume:
-            check_same_settings(self.config, tree)
+            check_same_settings(self.config, dict(settings))
             return
         if used and not overwrite:
             raise JaxmapError(
                 "the folder holds a run already",
                 where=self.path,
-                fix="go on with it (--resume), replace it (--overwrite), or choose another folder",
+                fix="resume it (--resume), replace it (--overwrite), or choose another folder",
             )
         self._clear()
-        write_yaml(self.config, tree)
+        write_yaml(self.config, dict(settings))
 
     @property
     def _files(self) -> tuple[Path, ...]:
@@ -89,18 +86,22 @@ class RunFolder:
         derived = (self.ply, self.geotiff, self.picture, self.missed)
         return (*derived, self.metrics, self.poses, report, self.config, *scored)
 
-    def check_apart(self, plan: Plan, config: MapConfig) -> None:
+    def check_apart(self, source: str, images: Iterable[Path], inputs: Iterable[Path | None]) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
+
+        Args:
+            source: the sequence.
+            images: its images; the run folder may not lie in their folders.
+            inputs: other files that are read, such as poses.
 
         Raises:
             UsageError: the folder is the sequence's own, or an output would overwrite an input.
         """
         here = self.path.resolve()
-        images = {frame.left.parent.resolve() for frame in plan.sequence.frames}
-        images |= {frame.right.parent.resolve() for frame in plan.sequence.frames}
-        if here == Path(plan.source).resolve() or any(here == folder or folder in here.parents for folder in images):
+        folders = {folder.resolve() for folder in {image.parent for image in images}}
+        if here == Path(source).resolve() or not folders.isdisjoint((here, *here.parents)):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
-        check_inputs_stay(self._files, (config.poses, config.calibration, config.model))
+        check_inputs_stay(self._files, inputs)
 
     def _is_run(self) -> bool:
         """Whether what lies here was written by a run."""
@@ -158,11 +159,14 @@ def write_key_frame(
     folder: RunFolder, index: int, rectified: RectifiedFrame, labels: np.ndarray | None, classes: tuple[str, ...]
 ) -> None:
     """Writes the pictures of one frame: left image, disparity and, where there are any, labels."""
+    from PIL import Image
+
     pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
     for kind, picture in pictures.items():
-        _write_image(folder, f"{index:06d}_{kind}.png", picture)
+        with atomic_path(folder.pictures / f"{index:06d}_{kind}.png") as temporary:
+            Image.fromarray(picture).save(temporary)
 
 
 EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.png"}
@@ -229,10 +233,3 @@ def count_missed(rule: FusionRule, attributes: MapAttributes, voxel_map: VoxelMa
             "greatest_missed_probability": round(float(np.nanmax(missed, initial=0.0)), 4),
         }
     }
-
-
-def _write_image(folder: RunFolder, name: str, picture: np.ndarray) -> None:
-    from PIL import Image
-
-    with atomic_path(folder.pictures / name) as temporary:
-        Image.fromarray(picture).save(temporary)

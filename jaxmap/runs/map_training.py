@@ -16,7 +16,8 @@ from jaxmap.datasets.crs import Extent, read_crs
 from jaxmap.datasets.label_raster import LabelRaster, choose_coding, read_label_orthomosaic
 from jaxmap.errors import JaxmapError, UsageError, options_as, with_options
 from jaxmap.evaluation.cells import CellGrid
-from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
+from jaxmap.evaluation.evaluate import evaluate_map
+from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.geometry.camera import project
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.files import bundled
@@ -27,7 +28,7 @@ from jaxmap.mapping.step import MapperParams
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.deeplab import Weights, fold_batch_norm
-from jaxmap.runs.evaluation import class_map_of
+from jaxmap.runs.evaluation import class_layer_of
 from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.runs.segmentation import Segmenter
 from jaxmap.runs.training_plan import TaughtMapping, TrainConfig, TrainingPlan, check_scale, describe_start, option_here
@@ -211,7 +212,7 @@ class MapValidator:
         classes: dict[str, dict[str, Any]] = {}
         for index, raster in data.truth.rasters.items():
             name = plan.labeller.classes[index]
-            class_map = class_map_of(
+            class_map = class_layer_of(
                 voxel_map,
                 plan.params.fusion,
                 plan.rule,

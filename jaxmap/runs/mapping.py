@@ -16,7 +16,7 @@ from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
-from jaxmap.report.html import write_report
+from jaxmap.report.run_page import write_report
 from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Notify, Plan

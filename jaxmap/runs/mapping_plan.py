@@ -32,7 +32,7 @@ from jaxmap.mapping.sequence import frame_form
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.tensor_files import shortened
-from jaxmap.runs.config import MapConfig
+from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import Frame, GridSpec, StereoCamera, make_grid
@@ -247,10 +247,15 @@ class Plan:
         return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
 
     @property
-    def resolved(self) -> dict[str, Any]:
-        """Settings that were left to the data, as they have come out."""
+    def images(self) -> Iterator[Path]:
+        """The files of all images."""
+        return (image for frame in self.sequence.frames for image in (frame.left, frame.right))
+
+    def settings(self, config: MapConfig) -> dict[str, Any]:
+        """The settings as plain values, with the sequence and what was left to the data resolved."""
         classes = {"classes": list(self.labeller.classes)} if self.labeller.classes else {}
-        return classes | ({"model_sha256": self.model.sha256} if self.model is not None else {})
+        model = {"model_sha256": self.model.sha256} if self.model is not None else {}
+        return {"sequence": self.source, **config_tree(config), **classes, **model}
 
     def digest(self, count: int) -> str:
         """A fingerprint of the first frames, their poses and the camera: what a resumed run must share."""

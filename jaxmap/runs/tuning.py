@@ -19,7 +19,7 @@ from jaxmap.host.output_folder import write_json, write_yaml
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.report.tuning_page import tuning_page
 from jaxmap.runs.config import MapConfig, config_tree
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
 from jaxmap.tuning.descent import Step, descend
@@ -203,7 +203,7 @@ class TuningRun:
         done = 0
         for source, plan in zip(self._sources, self._plans, strict=True):
             recipe = CacheRecipe(plan.front_end.camera, plan.grid, plan.labeller, plan.rule, plan.depth_range_m)
-            class_map = class_map_of(
+            class_map = class_layer_of(
                 plan.mapper.init(),
                 plan.params.fusion,
                 plan.rule,

@@ -18,14 +18,15 @@ import numpy as np
 
 from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.evaluation.cells import CellGrid, column_shares, make_cells, map_cells
-from jaxmap.evaluation.evaluate import ClassMap, ScoringOptions, evaluate_map
+from jaxmap.evaluation.evaluate import ClassLayer, evaluate_map
+from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.evaluation.map_scores import Confusion, confusion_scores, count_confusion
 from jaxmap.evaluation.truth_cells import truth_cells
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.files import bundled
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
 from jaxmap.runs.config import DepthConfig, FusionConfig, GridConfig, MapConfig, load_config
-from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
+from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.types import VoxelMap
 
@@ -120,13 +121,13 @@ class Scored:
 
     def __init__(self, plan: Plan, voxel_map: VoxelMap, truth: Path) -> None:
         where: dict[str, Any] = {"site_origin": plan.sequence.site_origin, "crs": plan.sequence.crs}
-        self.class_map: ClassMap = class_map_of(voxel_map, plan.params.fusion, plan.rule, TARGET, **where)
-        self.raster: LabelRaster = read_truth([truth], self.class_map.place, TruthOptions())
+        self.class_layer: ClassLayer = class_layer_of(voxel_map, plan.params.fusion, plan.rule, TARGET, **where)
+        self.raster: LabelRaster = read_truth([truth], self.class_layer.place, TruthOptions())
 
     @cached_property
     def scores(self) -> dict[str, Any]:
         """As `jaxmap evaluate` computes them."""
-        return evaluate_map(self.class_map, self.raster, None, ScoringOptions(cell_size_m=CELL_M)).scores
+        return evaluate_map(self.class_layer, self.raster, None, ScoringOptions(cell_size_m=CELL_M)).scores
 
     @cached_property
     def lattices(self) -> list[dict[str, Any]]:
@@ -139,7 +140,7 @@ class Scored:
 
     def confusions(self, cell_size_m: float = CELL_M) -> list[Confusion]:
         """The confusion on each lattice."""
-        class_map, found = self.class_map, []
+        class_map, found = self.class_layer, []
         usual = make_cells(class_map.grid, cell_size_m)
         for shift in np.ndindex(LATTICES, LATTICES):
             east_m, north_m = np.array(usual.origin_m) - np.array(shift) * cell_size_m / LATTICES

@@ -22,7 +22,7 @@ from common import RANGE_M, Frames, Table, command_line, parse
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions
-from jaxmap.datasets.pose_files import write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.refinement.rig import vehicle_axes

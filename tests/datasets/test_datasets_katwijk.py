@@ -24,7 +24,7 @@ from jaxmap.datasets.katwijk import (
 )
 from jaxmap.datasets.poses import poses_at, read_poses, write_tum
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.evaluation.pose_scores import pose_errors
+from jaxmap.evaluation.geometry_scores import pose_errors
 from jaxmap.host.files import config_folder
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rasterio import Affine
 from rasterio.enums import ColorInterp
-from truth_files import CRS, SITE, class_map, write_raster
+from truth_files import CRS, SITE, class_layer, write_raster
 
 from jaxmap.datasets.crs import Extent
 from jaxmap.datasets.label_raster import (
@@ -39,7 +39,7 @@ def blobs(size: int = 160) -> np.ndarray:
 
 
 def shares(raster, crs: str | None = CRS):
-    cells = make_cells(class_map(np.zeros((40, 40), bool)).grid, 0.2)
+    cells = make_cells(class_layer(np.zeros((40, 40), bool)).grid, 0.2)
     return truth_cells(raster, cells, SITE, crs)
 
 

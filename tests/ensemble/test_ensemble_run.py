@@ -64,7 +64,7 @@ def test_the_layer_is_in_every_output(run):
 def test_a_run_that_was_cut_off_ends_with_the_same_members(run, scene_folder, cli, tmp_path):
     folder = RunFolder(tmp_path / "run")
     settings = {"ensemble": {"members": MEMBERS}}
-    folder.begin(planned(scene_folder, **settings), config_of(**settings), resume=False, overwrite=False)
+    folder.begin(planned(scene_folder, **settings).settings(config_of(**settings)), resume=False, overwrite=False)
 
     def cut(fused: FusedFrame) -> None:
         if fused.prepared.index == 3:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,9 +9,8 @@ from PIL import Image
 
 from jaxmap.ensemble.layer import EnsembleLayers
 from jaxmap.fusion.query import TopDown
-from jaxmap.report.missed_plan import MOST, missed_colours, missed_picture
-from jaxmap.report.missed_section import missed_section
-from jaxmap.report.relief import UNOBSERVED_COLOUR
+from jaxmap.report.run_page import missed_section
+from jaxmap.report.top_down import MOST_MISSED, UNOBSERVED_COLOUR, missed_colours, missed_picture
 from jaxmap.types import GridSpec
 
 SHAPE = (12, 9)
@@ -25,7 +21,7 @@ def flat() -> tuple[EnsembleLayers, TopDown]:
     """Level ground with one column of each kind."""
     missed, probability = np.zeros(SHAPE, np.float32), np.zeros(SHAPE, np.float32)
     probability[CALLED] = 0.9
-    for place, value in ((LIKELY, 0.3), (MORE, MOST)):
+    for place, value in ((LIKELY, 0.3), (MORE, MOST_MISSED)):
         missed[place] = probability[place] = value
     observed = np.ones(SHAPE, bool)
     observed[UNSEEN] = False
@@ -61,21 +57,17 @@ def test_the_picture_is_written_and_is_the_same_again(with_path, tmp_path):
         assert min(image.size) > 500
 
 
-def a_run(path: Path, ensemble: dict) -> SimpleNamespace:
-    return SimpleNamespace(path=path, metrics={"ensemble": ensemble} if ensemble else {})
-
-
 def test_the_section_tells_what_is_expected(tmp_path):
     ensemble = {"class": "<rock>", "members": 8, "missed_area_expected_m2": 1.25, "observed_area_m2": 80.0}
     Image.new("RGB", (40, 30)).save(tmp_path / "missed.png")
     remarks: list[str] = []
-    section = missed_section(a_run(tmp_path, ensemble), remarks)
+    section = missed_section(tmp_path, {"ensemble": ensemble}, remarks)
     assert "1.25" in section and "&lt;rock&gt;" in section and "<rock>" not in section and not remarks
-    assert missed_section(a_run(tmp_path, {}), remarks) == ""
+    assert missed_section(tmp_path, {}, remarks) == ""
 
 
 def test_a_picture_that_cannot_be_read_is_left_out_and_told(tmp_path):
     (tmp_path / "missed.png").write_bytes(b"no picture")
     remarks: list[str] = []
-    assert missed_section(a_run(tmp_path, {"class": "rock"}), remarks) == ""
+    assert missed_section(tmp_path, {"ensemble": {"class": "rock"}}, remarks) == ""
     assert remarks == ["missed.png could not be read and is left out."]

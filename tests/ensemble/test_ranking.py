@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from strategies import rngs
 
-from jaxmap.evaluation.ranking import average_precision, ranking_scores, reliability, roc_auc
+from jaxmap.evaluation.map_scores import average_precision, ranking_scores, reliability, roc_auc
 
 
 def an_example(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -50,8 +50,8 @@ def as_numpy(top: TopDown) -> TopDown:
     return TopDown(*(np.asarray(leaf) for leaf in top))
 
 
-@settings(max_examples=12, deadline=None)
-@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, (), ("rock",), tuple("abcdefghijklmnopqrstu")]))
+@settings(max_examples=8)
+@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, ()]))
 def test_occupied_voxels_are_those_of_the_map(seed, classes) -> None:
     voxel_map, params, rule = random_map(seed, classes), make_fusion_params(classes), FusionRule()
     voxels = occupied_voxels(voxel_map, params, rule)
@@ -71,7 +71,7 @@ def test_occupied_voxels_are_those_of_the_map(seed, classes) -> None:
     assert dtypes == [np.int32, np.float32, np.uint8, np.float32, np.float32]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6)
 @given(st.integers(0, 2**31), st.booleans())
 def test_ply_holds_the_voxels(tmp_path_factory, seed, georeferenced) -> None:
     path = tmp_path_factory.mktemp("ply") / "map.ply"
@@ -99,8 +99,8 @@ def test_ply_of_nothing_and_of_odd_names(tmp_path) -> None:
     assert len(vertices) == 0 and "class 0 \\xe9 x" in comments
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, (), tuple("abcdefghijklmnopqrstu")]), st.booleans())
+@settings(max_examples=8)
+@given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, ()]), st.booleans())
 def test_geotiff_holds_each_column_at_its_place(tmp_path_factory, seed, classes, georeferenced) -> None:
     import rasterio
 
@@ -131,7 +131,7 @@ def test_geotiff_holds_each_column_at_its_place(tmp_path_factory, seed, classes,
                 assert np.array_equal(probabilities, top.probability[:, x, y])
 
 
-def test_an_unknown_crs_is_told(tmp_path) -> None:
+def test_an_unknown_crs_is_an_error(tmp_path) -> None:
     voxel_map = random_map(0)
     top = as_numpy(top_down(voxel_map, make_fusion_params(ROVER_CLASSES), FusionRule()))
     with pytest.raises(JaxmapError, match="unknown coordinate reference system 'EPSG:1'") as caught:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from jaxmap.datasets.katwijk import read_gps, read_imu, read_wheels
 from jaxmap.datasets.poses import make_pose_track, poses_at
 from jaxmap.errors import JaxmapError
-from jaxmap.evaluation.pose_scores import PoseErrors, pose_errors
+from jaxmap.evaluation.geometry_scores import PoseErrors, pose_errors
 from jaxmap.localisation.estimate import estimate_poses, knot_times
 from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, in_gap, increments, time_to_nearest
 

@@ -8,9 +8,8 @@ from PIL import Image
 
 from jaxmap.fusion.query import TopDown
 from jaxmap.labels import IGNORE, ROVER_CLASSES, class_colours
-from jaxmap.report.pictures import colourise_disparity, colourise_labels, overlay_labels, top_down_picture
-from jaxmap.report.plan_sheet import _nice
-from jaxmap.report.relief import UNOBSERVED_COLOUR, relief
+from jaxmap.report.pictures import colourise_disparity, overlay_labels
+from jaxmap.report.top_down import UNOBSERVED_COLOUR, _nice, top_down_colours, top_down_picture
 from jaxmap.types import make_grid
 
 MANY = tuple(f"class {index}" for index in range(21))
@@ -55,7 +54,6 @@ def test_disparity_without_a_range(value) -> None:
 def test_labels_and_overlay() -> None:
     labels = np.array([[0, 1], [2, IGNORE]], np.uint8)
     table = class_colours(ROVER_CLASSES)
-    assert np.array_equal(colourise_labels(labels, ROVER_CLASSES), table[labels])
     image = np.random.default_rng(0).integers(0, 256, (2, 2, 3)).astype(np.uint8)
     assert np.array_equal(overlay_labels(image, labels, ROVER_CLASSES, alpha=0.0), image)
     full = overlay_labels(image, labels, ROVER_CLASSES, alpha=1.0)
@@ -67,7 +65,7 @@ def test_labels_and_overlay() -> None:
 
 def test_level_ground_has_exactly_its_class_colours() -> None:
     top = flat_view()
-    view = relief(top, np.array([0.2, 0.2]), ROVER_CLASSES)
+    view = top_down_colours(top, np.array([0.2, 0.2]), ROVER_CLASSES)
     assert not view.by_height
     assert np.array_equal(view.colours, class_colours(ROVER_CLASSES)[top.label])
 
@@ -79,12 +77,13 @@ def test_slopes_to_the_north_west_are_brighter() -> None:
     falling_east = rising_east._replace(height_m=rising_east.height_m[::-1])
     cell_m = np.array([0.2, 0.2])
     lit, dark = (
-        relief(view, cell_m, ROVER_CLASSES).colours.astype(int).sum(axis=-1) for view in (rising_east, falling_east)
+        top_down_colours(view, cell_m, ROVER_CLASSES).colours.astype(int).sum(axis=-1)
+        for view in (rising_east, falling_east)
     )
     assert (lit > dark).all()
 
 
-def test_plan_shows_the_classes_that_are_there(tmp_path) -> None:
+def test_top_down_map_shows_the_classes_that_are_there(tmp_path) -> None:
     seen = np.zeros((300, 200), bool)
     seen[100:160, 50:90] = True
     top = flat_view((300, 200), seen=seen)
@@ -111,11 +110,11 @@ def test_plan_shows_the_classes_that_are_there(tmp_path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["bev.png"]
 
 
-@pytest.mark.parametrize("classes", [(), MANY, ("rock",)])
 @pytest.mark.parametrize(
-    ("shape", "size"), [((30, 20), 0.2), ((2, 90), 0.5), ((120, 1), (0.1, 0.3, 0.2)), ((1, 1), 1.0)]
+    ("classes", "shape", "size"),
+    [((), (30, 20), 0.2), (MANY, (2, 90), 0.5), (("rock",), (120, 1), (0.1, 0.3, 0.2)), (MANY, (1, 1), 1.0)],
 )
-def test_plan_of_every_shape(tmp_path, classes, shape, size) -> None:
+def test_top_down_map_of_every_shape(tmp_path, classes, shape, size) -> None:
     size_m = np.broadcast_to(np.asarray(size), (3,))
     grid = make_grid([0, 0, 0], [shape[0] * size_m[0], shape[1] * size_m[1], 1], size)
     top_down_picture(flat_view(shape, classes), grid, classes, None, tmp_path / "bev.png")
@@ -124,7 +123,7 @@ def test_plan_of_every_shape(tmp_path, classes, shape, size) -> None:
         assert min(image.size) > 150
 
 
-def test_plan_of_nothing(tmp_path) -> None:
+def test_top_down_map_of_nothing(tmp_path) -> None:
     grid = make_grid([0, 0, 0], [6, 4, 1], 0.2)
     top_down_picture(flat_view(seen=np.zeros((30, 20), bool)), grid, ROVER_CLASSES, None, tmp_path / "bev.png")
     assert not {tuple(colour) for colour in class_colours(ROVER_CLASSES)[:3]} & colours_in(tmp_path / "bev.png")

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from html_tables import tables_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -22,9 +23,10 @@ from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.report import voxel_view as voxel_view_module
-from jaxmap.report.faces import exposed_faces, merge_voxels
-from jaxmap.report.html import MAX_KEY_FRAMES, write_report
-from jaxmap.report.voxel_view import voxel_view
+from jaxmap.report.page import ACCENT, svg_of
+from jaxmap.report.run_page import MAX_KEY_FRAMES, write_report
+from jaxmap.report.tuning_page import tuning_page
+from jaxmap.report.voxel_view import exposed_faces, merge_voxels, voxel_view
 from jaxmap.report.wording import name_and_unit, number_text, value_text
 from jaxmap.types import VoxelMap, make_grid, make_voxel_map
 
@@ -91,7 +93,7 @@ def voxels_of(index: np.ndarray, label: np.ndarray | None = None, size_m=(0.2, 0
 solids = hnp.arrays(bool, st.tuples(*[st.integers(1, 5)] * 3))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25)
 @given(solids)
 def test_exposed_faces_close_the_voxels(solid) -> None:
     index = np.argwhere(solid)
@@ -109,7 +111,7 @@ def test_exposed_faces_close_the_voxels(solid) -> None:
     assert (np.abs(middle).max(axis=-1, initial=0) < 0.5 + 1e-9).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10)
 @given(solids)
 def test_undersides_can_be_left_out(solid) -> None:
     index = np.argwhere(solid)
@@ -117,7 +119,7 @@ def test_undersides_can_be_left_out(solid) -> None:
     assert len(exposed_faces(index).voxel) - len(exposed_faces(index, undersides=False).voxel) == down
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25)
 @given(solids, st.integers(0, 1000), st.integers(-4, 4))
 def test_merged_voxels_carry_the_label_of_most(solid, seed, shift) -> None:
     index = np.argwhere(solid) + 2 * shift
@@ -216,11 +218,11 @@ def page_of(run: Path) -> Page:
     return Page((run / "report.html").read_text(encoding="utf-8"))
 
 
-def test_page_tells_the_run(made_run) -> None:
+def test_page_shows_the_run(made_run) -> None:
     page = page_of(made_run)
     text = page.text.replace("\N{NO-BREAK SPACE}", " ").replace("\N{NARROW NO-BREAK SPACE}", " ")
     for expected in (
-        *("From above", "In 3D", "Key frames", "Frame 000020", "Figures", "Skipped frames", "Notes", "Configuration"),
+        *("Top-down map", "In 3D", "Key frames", "Frame 000020", "Metrics", "Skipped frames", "Notes", "Configuration"),
         *("folder · labels: deeplab · EPSG:32631", "40", "9.2 m", "4.8", "1.4 GiB", "96 m²", "2 400"),
         *("left_7", "no pose within 0.2 s", "heading from motion", "61.5", "81.2 %", "New number", "1.25 m"),
         *("60 × 40 × 12", "1, 8.5 m", "Made by jaxmap 0.1.0."),
@@ -283,22 +285,13 @@ def test_optional_parts_are_left_out(run_folder) -> None:
     page = page_of(run_folder)
     assert not page.all("img")
     assert "In 3D" in page.text
-    for absent in (
-        "From above",
-        "Key frames",
-        "Skipped frames",
-        "Notes",
-        "Configuration",
-        "frames skipped",
-        "None",
-        "nan",
-    ):
-        assert absent not in page.text
+    absent = ("Top-down map", "Key frames", "Skipped frames", "Notes", "Configuration", "frames skipped", "None", "nan")
+    assert not [text for text in absent if text in page.text]
     assert page.all("title")
     assert run_folder.name in page.text
 
 
-def test_broken_optional_parts_are_left_out_and_told(run_folder) -> None:
+def test_broken_optional_parts_are_left_out_with_a_remark(run_folder) -> None:
     (run_folder / "bev.png").write_bytes(b"no picture")
     (run_folder / "pictures" / "000000_left.png").write_bytes(b"")
     (run_folder / "poses.tum").write_text("a b c d")
@@ -386,3 +379,41 @@ def test_wording() -> None:
     assert value_text(None, "m") == "–"
     assert value_text(False) == "no"
     assert value_text(-3, "m") == "\N{MINUS SIGN}3&nbsp;m"
+
+
+def test_charts_follow_the_theme_and_leave_the_page_alone() -> None:
+    from matplotlib.figure import Figure
+
+    drawing = Figure()
+    drawing.add_subplot().plot([0, 1], color=ACCENT, label="a < b")
+    chart = svg_of(drawing, "a & b")
+    assert chart == svg_of(drawing, "a & b")
+    assert chart.startswith('<svg class="chart"') and 'aria-label="a &amp; b"' in chart
+    assert "var(--accent)" in chart and ACCENT not in chart and "<text" in chart
+    assert "<style" not in chart and "DejaVu" not in chart and "axes_1" not in chart
+
+
+def test_tuning_page_shows_parameters_scores_and_charts() -> None:
+    score = dict(before=0.5, after=0.75, change=0.25, before_interval=[0.4, 0.6], after_interval=None)
+    scores = dict.fromkeys(
+        ("iou", "precision", "recall", "accuracy", "nll", "brier", "ece"), score | {"change_interval": None}
+    )
+    bins = {"before": [{"said": 0.2, "true": 0.1}], "after": []}
+    stage = {
+        "name": "fusion",
+        "best_step": 1,
+        "history": [{"step": step, "loss": 1.0 / (1 + step), "held_out": 1.1 / (1 + step)} for step in range(3)],
+        "scores": dict(held_out=scores, tuned_on=scores),
+        "calibration": dict(held_out=bins, tuned_on=bins),
+        "parameters": {"class_hit": 1.5, "class_kernel": [[0.0, 0.1], [0.2, 0.3]]},
+    }
+    result = {
+        **{"class": "rock", "labeller": "plane", "before": {"class_hit": 0.9}, "stages": [stage], "notes": [NASTY]},
+        "traverses": [{"sequence": "<a>", "frames": 6, "cells": 100, "held_out_cells": 20}],
+    }
+    content = tuning_page("mine", result)
+    page, by_name = Page(content), {row[0]: row for part in tables_of(content) for row in part.rows}
+    assert by_name["IoU"][1:] == ["0.500 (0.400 to 0.600)", "0.750", "0.250"]
+    assert by_name["class hit"][1:] == ["0.9", "1.5"] and by_name["<a>"][1:] == ["6", "100", "20"]
+    assert len(page.all("svg")) == 3 and NASTY in page.text
+    assert not re.findall(r"https?://(?!www.w3.org/)", content)

@@ -15,9 +15,9 @@ from PIL import Image
 from test_report import make_run
 
 from jaxmap.labels import ROVER_CLASSES, class_colours
-from jaxmap.report.html import write_report
+from jaxmap.report.run_page import write_report
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 _BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 # Chromium's own advice on a canvas that plotly reads back.

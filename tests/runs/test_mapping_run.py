@@ -284,7 +284,7 @@ def test_a_missing_or_broken_label_costs_its_frame_alone(scene_copy, tmp_path):
 def test_the_step_is_compiled_once_and_every_frame_told(scene_folder, tmp_path):
     plan = planned(scene_folder)
     folder = RunFolder(tmp_path / "run")
-    folder.begin(plan, config_of(), resume=False, overwrite=False)
+    folder.begin(plan.settings(config_of()), resume=False, overwrite=False)
     frames = []
     run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=lambda line: None, on_frame=frames.append)
     assert [fused.prepared.index for fused in frames] == list(range(FRAMES))

@@ -39,7 +39,7 @@ def cut_after(index: int) -> Callable[[FusedFrame], None]:
 def run_until(sequence: Path, out: Path, index: int, checkpoint_every_s: float = 0.0) -> None:
     """Maps into `out`, saving after each frame, and is cut off after a frame, before that one is saved."""
     folder = RunFolder(out)
-    folder.begin(planned(sequence), config_of(), resume=False, overwrite=False)
+    folder.begin(planned(sequence).settings(config_of()), resume=False, overwrite=False)
     with pytest.raises(Cut):
         run_plan(
             planned(sequence),
@@ -82,7 +82,7 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, fini
 def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
     run_until(scene_folder, tmp_path / "run", 2)
     folder = RunFolder(tmp_path / "run")
-    folder.begin(planned(scene_folder), config_of(), resume=True, overwrite=False)
+    folder.begin(planned(scene_folder).settings(config_of()), resume=True, overwrite=False)
     with pytest.raises(Cut):
         run_plan(
             planned(scene_folder),

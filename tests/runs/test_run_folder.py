@@ -119,7 +119,7 @@ def test_an_interrupt_saves_what_is_there(scene_folder, tmp_path):
     from planned_runs import config_of, planned
 
     plan, folder = planned(scene_folder), RunFolder(tmp_path / "run")
-    folder.begin(plan, config_of(), resume=False, overwrite=False)
+    folder.begin(plan.settings(config_of()), resume=False, overwrite=False)
     told = []
 
     def interrupt(fused):

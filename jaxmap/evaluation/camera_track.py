@@ -1,4 +1,4 @@
-"""Which cells the cameras looked at, and from how far: the domain that does not depend on what a map observed."""
+"""Which cells the cameras see, and from how far: a domain that does not depend on what a map observed."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _TILE_M = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
-    """The poses of a pinhole camera.
+class CameraTrack:
+    """A pinhole camera and its poses along a drive.
 
     Attributes:
         T_world_camera: (N, 4, 4), relative to the site origin.
         focal_px: fx, fy.
         centre_px: cx, cy.
         size_px: width, height.
-        max_range_m: how far the map was made; cells beyond it are not asked for.
+        max_range_m: greatest depth that was mapped; cells beyond it are not in view.
     """
 
     T_world_camera: Float64[np.ndarray, "N 4 4"]
@@ -32,28 +32,27 @@ class Views:
 
 
 def view_range(
-    cells: CellGrid, ground_m: Float[np.ndarray, "I J"], views: Views, max_range_m: float
+    cells: CellGrid, ground_m: Float[np.ndarray, "I J"], track: CameraTrack, max_range_m: float
 ) -> Float64[np.ndarray, "I J"]:
-    """How near a camera came to each cell while it looked at it: infinite where none did within the range.
+    """Distance of the nearest camera that sees each cell, metres: infinite where none does within the range.
 
-    A camera looks at a cell where the cell's centre, on the ground, falls into its image; the range is the distance
-    between the two. Rocks that hide a cell are not considered.
+    A camera sees a cell whose centre, on the ground, projects into its image. Occlusion is not considered.
 
     Args:
         cells: the cells.
         ground_m: height of the ground in each, world (`ground_height`).
-        views: the cameras.
-        max_range_m: how far they look.
+        track: the cameras.
+        max_range_m: how far they see.
     """
     x, y = cells.centres()
     nearest_m = np.full(cells.shape, np.inf)
-    for T_world_camera in np.asarray(views.T_world_camera, np.float64):
+    for T_world_camera in np.asarray(track.T_world_camera, np.float64):
         position = T_world_camera[:3, 3]
         near_x, near_y = _within(x, position[0], max_range_m), _within(y, position[1], max_range_m)
         here = (near_x, near_y)
         offset = np.stack(np.broadcast_arrays(x[near_x, None], y[None, near_y], ground_m[here]), axis=-1) - position
         distance_m = np.linalg.norm(offset, axis=-1)
-        seen = _in_image(offset @ T_world_camera[:3, :3], views) & (distance_m <= max_range_m)
+        seen = _in_image(offset @ T_world_camera[:3, :3], track) & (distance_m <= max_range_m)
         nearest_m[here] = np.where(seen, np.minimum(nearest_m[here], distance_m), nearest_m[here])
     return nearest_m
 
@@ -87,12 +86,12 @@ def _within(centres: np.ndarray, position: float, range_m: float) -> slice:
     return slice(int(first), int(last))
 
 
-def _in_image(points_camera: np.ndarray, views: Views) -> np.ndarray:
+def _in_image(points_camera: np.ndarray, track: CameraTrack) -> np.ndarray:
     depth = points_camera[..., 2]
     ahead = depth > 0
     safe = np.where(ahead, depth, 1.0)
     inside = ahead
     for axis in (0, 1):
-        pixel = views.focal_px[axis] * points_camera[..., axis] / safe + views.centre_px[axis]
-        inside = inside & (pixel >= -0.5) & (pixel < views.size_px[axis] - 0.5)
+        pixel = track.focal_px[axis] * points_camera[..., axis] / safe + track.centre_px[axis]
+        inside = inside & (pixel >= -0.5) & (pixel < track.size_px[axis] - 0.5)
     return inside
