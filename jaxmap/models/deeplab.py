@@ -14,13 +14,11 @@ from flax import nnx
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, UInt8
 
 from jaxmap.models.architecture import Architecture, check_architecture, folded
-from jaxmap.models.convolutions import resize_bilinear
+from jaxmap.models.backbones import RESNET_UNITS, MobileNetV2, ResNet, Xception65
+from jaxmap.models.convolutions import winograd_kernel
 from jaxmap.models.heads import Aspp, Decoder
 from jaxmap.models.layers import ConvBlock
-from jaxmap.models.mobilenet_v2 import MobileNetV2
-from jaxmap.models.resnet import ResNet
-from jaxmap.models.winograd import transformed_kernel
-from jaxmap.models.xception import Xception65
+from jaxmap.models.resizing import resize_bilinear
 from jaxmap.types import to_device
 
 Weights = dict[str, Array]
@@ -34,9 +32,7 @@ Images = UInt8[Array, "B H W 3"] | Float[Array, "B H W 3"]
 
 _BACKBONES: dict[str, Callable[[Architecture], MobileNetV2 | ResNet | Xception65]] = {
     "mobilenet_v2": MobileNetV2,
-    "resnet18": ResNet,
-    "resnet50": ResNet,
-    "resnet101": ResNet,
+    **dict.fromkeys(RESNET_UNITS, ResNet),
     "xception65": Xception65,
 }
 
@@ -232,12 +228,12 @@ def fold_batch_norm(
 def inference_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
     """The network in the form that computes logits fastest; its weights are neither to be trained nor to be kept.
 
-    Batch norm is folded, and on a CPU the kernels of large dense convolutions are transformed (`winograd`).
+    Batch norm is folded, and on a CPU the kernels of large dense convolutions are transformed (`convolve_winograd`).
     """
     architecture, result = fold_batch_norm(architecture, {name: np.asarray(value) for name, value in weights.items()})
     if jax.default_backend() == "cpu":
         for path, block in nnx.iter_modules(_skeleton(architecture)):
             if isinstance(block, ConvBlock) and block.transformable:
                 name = ".".join(map(str, (*path, "kernel")))
-                result[name] = transformed_kernel(jnp.asarray(result[name]))
+                result[name] = winograd_kernel(jnp.asarray(result[name]))
     return pure_network(architecture, result)

@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.mobilenet_v2 import STAGES as MOBILENET_STAGES
-from jaxmap.models.resnet import UNITS as RESNET_UNITS
+from jaxmap.models.backbones import MOBILENET_STAGES, RESNET_UNITS
 
 
 class Row(NamedTuple):

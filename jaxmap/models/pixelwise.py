@@ -16,8 +16,9 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from jaxmap.errors import UsageError
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.convolutions import PRECISION, resize_bilinear, resize_rows
+from jaxmap.models.convolutions import PRECISION
 from jaxmap.models.deeplab import Images, padded_size
+from jaxmap.models.resizing import resize_bilinear, resize_rows
 
 Size = tuple[int, int]
 """Height and width in pixels."""
