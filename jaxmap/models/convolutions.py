@@ -36,7 +36,7 @@ class Axis(NamedTuple):
         stride: pixels between the windows of neighbouring outputs.
         dilation: pixels between the elements of the kernel.
         before: zeros before the image.
-        count: outputs.
+        outputs: pixels of the result.
     """
 
     size: int
@@ -44,7 +44,7 @@ class Axis(NamedTuple):
     stride: int
     dilation: int
     before: int
-    count: int
+    outputs: int
 
     @classmethod
     def of(cls, size: int, kernel: int, stride: int, dilation: int, padding: Padding) -> Axis:
@@ -63,7 +63,7 @@ class Axis(NamedTuple):
         Elements that meet nothing but padding are left out, and nothing is padded for them: at a dilation
         as large as the image (36 on 32x32 features) only the middle one is left.
         """
-        span = (self.count - 1) * self.stride
+        span = (self.outputs - 1) * self.stride
         firsts = {index: self.first(index) for index in range(self.kernel)}
         firsts = {index: first for index, first in firsts.items() if first < self.size and first + span >= 0}
         start = max(0, -min(firsts.values()))
@@ -77,7 +77,7 @@ class Axis(NamedTuple):
         """The pixels that an element meets, and the outputs at which it does."""
         first, stride = self.first(index), self.stride
         low = max(0, -(first // stride))
-        high = min(self.count, (self.size - 1 - first) // stride + 1)
+        high = min(self.outputs, (self.size - 1 - first) // stride + 1)
         return slice(first + low * stride, max(first + (high - 1) * stride + 1, 0), stride), slice(low, max(high, low))
 
 
@@ -205,7 +205,7 @@ def _depthwise_images_gradient(
     """The turned kernel slid over the cotangent, between whose pixels lie stride - 1 zeros."""
     slices, pads = [], []
     for axis in axes:
-        spread = (axis.count - 1) * axis.stride + 1
+        spread = (axis.outputs - 1) * axis.stride + 1
         # Pixel p met element k at p - first(k) of the spread cotangent.
         firsts = {index: -axis.first(index) for index in range(axis.kernel)}
         firsts = {index: first for index, first in firsts.items() if first < spread and first + axis.size > 0}
@@ -240,7 +240,7 @@ def kernel_gradient_by_rows(
     """The same, a few rows at a time, which stay in the cache for all elements, summed by matrix products."""
     rows, columns = axes
     batch, channels = images.shape[0], images.shape[3]
-    most = _BLOCK // (columns.count * channels)
+    most = _BLOCK // (columns.outputs * channels)
     several = max(n for n in range(1, batch + 1) if batch % n == 0 and (n == 1 or n <= most))
     elements = [(row, column) for row in range(rows.kernel) for column in range(columns.kernel)]
 
@@ -248,7 +248,7 @@ def kernel_gradient_by_rows(
         return jax.lax.dynamic_slice(array, (image, row, 0, 0), (several, 1, *array.shape[2:]))[:, 0]
 
     def add_row(step: Array, totals: list[Array]) -> list[Array]:
-        image, row_out = step // rows.count * several, step % rows.count
+        image, row_out = step // rows.outputs * several, step % rows.outputs
         back = rows_of(cotangent, image, row_out)
         result = []
         for total, (row, column) in zip(totals, elements, strict=True):
@@ -261,7 +261,7 @@ def kernel_gradient_by_rows(
         return result
 
     zeros = [jnp.zeros(channels, cotangent.dtype)] * len(elements)
-    totals = jax.lax.fori_loop(0, batch // several * rows.count, add_row, zeros)
+    totals = jax.lax.fori_loop(0, batch // several * rows.outputs, add_row, zeros)
     return jnp.stack(totals).reshape(rows.kernel, columns.kernel, 1, channels)
 
 

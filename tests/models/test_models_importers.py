@@ -10,7 +10,7 @@ from golden.seeded_weights import exported, seeded_weights
 from safetensors.numpy import save_file
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models import import_tables as tables
+from jaxmap.models import importers as tables
 from jaxmap.models.architecture import (
     Architecture,
     tf_architecture,

@@ -19,7 +19,7 @@ from safetensors.numpy import save_file
 
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
-from jaxmap.models import import_tables as tables
+from jaxmap.models import importers as tables
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import load_model, save_model
 from jaxmap.runs import weights as weight_files
