@@ -30,7 +30,7 @@ def main() -> None:
     given = parser.parse_args()
     sys.path[:0] = [str(TESTS)]
     from golden.seeded_weights import seeded_image
-    from models.test_models_golden import seeded_checkpoint
+    from models.test_golden_logits import seeded_checkpoint
 
     print(f"{'network':14s}{'stride':>7s}{'size':>10s}{'greatest difference':>21s}{'same class':>12s}")
     for path in sorted(given.logits.glob("*.npy")):

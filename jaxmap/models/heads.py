@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -135,7 +135,7 @@ def _shifted_taps(source: int, target: int, size: int, align_corners: bool) -> _
     return _ShiftedTaps(low[moved], high[moved], (1 - share[moved]) * inside, share[moved] * inside)
 
 
-def _resized(images: Array, taps: list[Array], axis: int) -> Array:
+def _resized(images: Array, taps: Sequence[Array | np.ndarray], axis: int) -> Array:
     """Images resized along an axis by the taps of one kernel element."""
     low, high, low_weight, high_weight = taps
     shape = [-1 if place == axis else 1 for place in range(4)]

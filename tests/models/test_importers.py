@@ -20,6 +20,8 @@ from jaxmap.models.architecture import (
 from jaxmap.models.deeplab import weight_shapes
 from jaxmap.models.importers import VOC_CLASSES, convert, import_weights
 
+DEEPEST = pytest.param("resnet101", marks=pytest.mark.slow)
+
 
 def same(ours: dict[str, np.ndarray], architecture: Architecture, holds: str) -> bool:
     expected = seeded_weights(architecture)
@@ -27,7 +29,7 @@ def same(ours: dict[str, np.ndarray], architecture: Architecture, holds: str) ->
     return set(ours) == set(names) and all(np.array_equal(ours[name], expected[name]) for name in names)
 
 
-@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet18", "resnet50", "resnet101"])
+@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet18", "resnet50", DEEPEST])
 def test_torchvision_backbones(backbone, tmp_path):
     architecture = torch_architecture(backbone, ("background", "sand", "rock"))
     source = exported(architecture, list(tables.torchvision_backbone(backbone)), tables.TORCH)
@@ -76,8 +78,8 @@ def test_the_names_of_timm_are_covered():
         convert(state, rows, tables.TORCH, architecture, holds="backbone", where="timm")
 
 
-@pytest.mark.parametrize("backbone", ["resnet18", "resnet50", "resnet101"])
-def test_timm_calls_resnets_as_torchvision_does_and_names_what_is_missing(backbone, tmp_path):
+def test_timm_calls_resnets_as_torchvision_does_and_names_what_is_missing(tmp_path):
+    backbone = "resnet18"
     architecture = torch_architecture(backbone, ("background", "sand", "rock"))
     source = exported(architecture, list(tables.torchvision_backbone(backbone)), tables.TORCH)
     source |= {"fc.weight": np.zeros((10, 4), np.float32), "fc.bias": np.zeros(10, np.float32)}
@@ -91,8 +93,9 @@ def test_timm_calls_resnets_as_torchvision_does_and_names_what_is_missing(backbo
         import_weights(tmp_path / "d.safetensors")
 
 
-@pytest.mark.parametrize("backbone", ["resnet50", "resnet101"])
-@pytest.mark.parametrize("stride", [None, 16])
+@pytest.mark.parametrize(
+    ("backbone", "stride"), [("resnet50", None), pytest.param("resnet101", 16, marks=pytest.mark.slow)]
+)
 def test_torchvision_networks(backbone, stride, tmp_path):
     architecture = torchvision_architecture(backbone, VOC_CLASSES, output_stride=stride or 8)
     rows = [*tables.torchvision_backbone(backbone, "backbone."), *tables.torchvision_head(architecture)]
@@ -123,7 +126,7 @@ def test_timm_mobilenet(tmp_path):
     assert "timm" in imported.source and same(imported.weights, architecture, "backbone")
 
 
-@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet50"])
+@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet18"])
 def test_smp_networks(backbone, tmp_path):
     architecture = torch_architecture(backbone, ("a", "b"), output_stride=8)
     rows = [*tables.torchvision_backbone(backbone, "encoder."), *tables.smp_head(architecture)]

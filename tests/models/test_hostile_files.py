@@ -32,7 +32,7 @@ SMALL = replace(
     low_level_channels=2,
     atrous_rates=(),
 )
-many = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+many = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
 def refusal(path: Path) -> str:
