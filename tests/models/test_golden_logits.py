@@ -32,6 +32,8 @@ def seeded_checkpoint(backbone: str, path: Path) -> Path:
 def check(backbone: str, stride: int, size: tuple[int, int], folder: Path) -> None:
     imported = import_weights(seeded_checkpoint(backbone, folder / "smp.safetensors"), output_stride=stride)
     network = inference_network(imported.architecture, imported.weights)
+    transformed = [name for name, kernel in network.weights.items() if kernel.shape[:2] == (4, 4)]
+    assert len(transformed) == {"mobilenet_v2": 0, "resnet18": 10}.get(backbone, len(transformed))
     logits = np.asarray(jax.jit(network.apply)(network.weights, seeded_image(*size)[None])[0])
     key = f"{backbone}_{stride}_{size[0]}x{size[1]}"
     with np.load(GOLDEN) as golden:
