@@ -48,7 +48,7 @@ class Architecture:
     torchvision's DeepLabv3 (Chen et al. 2017, "Rethinking Atrous Convolution").
 
     Attributes:
-        backbone: what computes the features.
+        backbone: the network that computes the features.
         classes: names of the classes, in the order of the logits.
         output_stride: input pixels for each feature of the ASPP, 16 or 8.
         decoder: whether a low-level feature joins before the logits (DeepLabv3+) or not (DeepLabv3).

@@ -123,7 +123,7 @@ class PureNetwork(NamedTuple):
     """A network as a pure function and its weights.
 
     Attributes:
-        architecture: what it is.
+        architecture: the network.
         weights: its arrays by dotted path; a pytree.
         apply: `(weights, images) -> logits`, not yet jitted.
         apply_coarse: the same for `DeepLab.coarse_logits`.
@@ -136,11 +136,12 @@ class PureNetwork(NamedTuple):
 
 
 def pure_form(network: DeepLab) -> PureNetwork:
-    """Splits a network once, so that its calls cost no Python when they are jitted."""
-    return _pure_form(network.record, network_weights(network))
+    """The pure form of a network: its calls cost no Python when they are jitted."""
+    return pure_network(network.record, network_weights(network))
 
 
-def _pure_form(architecture: Architecture, weights: Weights) -> PureNetwork:
+def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
+    """The pure form of a network with given weights, which must be complete."""
     skeleton = _skeleton(architecture)
 
     def apply(weights: Weights, images: Images) -> Array:
@@ -149,7 +150,8 @@ def _pure_form(architecture: Architecture, weights: Weights) -> PureNetwork:
     def apply_coarse(weights: Weights, images: Images) -> Array:
         return _filled(skeleton, weights).coarse_logits(images)
 
-    return PureNetwork(architecture, weights, apply, apply_coarse)
+    arrays = {name: value if isinstance(value, Array) else to_device(value) for name, value in weights.items()}
+    return PureNetwork(architecture, arrays, apply, apply_coarse)
 
 
 def training_form(
@@ -195,12 +197,6 @@ def weight_shapes(architecture: Architecture) -> Mapping[str, tuple[int, ...]]:
     return MappingProxyType({name: tuple(leaf.shape) for name, leaf in shapes.items()})
 
 
-def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
-    """The pure form of a network with given weights, which must be complete."""
-    arrays = {name: value if isinstance(value, Array) else to_device(value) for name, value in weights.items()}
-    return _pure_form(architecture, arrays)
-
-
 def fold_batch_norm(
     architecture: Architecture, weights: Mapping[str, AnyArray]
 ) -> tuple[Architecture, dict[str, AnyArray]]:
@@ -222,7 +218,7 @@ def fold_batch_norm(
 
 
 def inference_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
-    """The network in the form that computes logits fastest; its weights are neither to be trained nor to be kept.
+    """The network in the form that computes logits fastest; its weights are not for training or for model files.
 
     Batch norm is folded, and on a CPU the kernels of large dense convolutions are transformed (`convolve_winograd`).
     """

@@ -164,7 +164,7 @@ def separable_on_upsampled(
         fine: features that follow them in the order of channels.
         depthwise: kernel of odd size; zeros stand beyond the image.
         pointwise: kernel of the 1x1 convolution that follows.
-        finish: what is done pixel by pixel with the result, in bands of rows.
+        finish: applied to bands of rows of the result; it must treat pixels alike.
         align_corners: see `resize_bilinear`.
     """
     channels, outputs, size = coarse.shape[3], pointwise.shape[1], depthwise.shape[0]

@@ -31,7 +31,7 @@ VOC_CLASSES: tuple[str, ...] = (
 """Pascal VOC's classes in the order of its label images."""
 
 
-class Imported(NamedTuple):
+class ImportedWeights(NamedTuple):
     """A converted checkpoint.
 
     Attributes:
@@ -49,7 +49,7 @@ class Imported(NamedTuple):
 
 def import_weights(
     path: str | PathLike[str], *, classes: Sequence[str] | None = None, output_stride: int | None = None
-) -> Imported:
+) -> ImportedWeights:
     """Reads a public checkpoint and converts it.
 
     Args:
@@ -337,13 +337,13 @@ class _Checkpoint(NamedTuple):
         naming: Naming = TORCH,
         holds: Holds = "network",
         ignored: Sequence[str] = (),
-    ) -> Imported:
+    ) -> ImportedWeights:
         """Converts the tensors; see `convert` of this module."""
         weights = convert(self.tensors, rows, naming, architecture, holds=holds, where=self.path, ignored=ignored)
-        return Imported(source, architecture, weights, holds)
+        return ImportedWeights(source, architecture, weights, holds)
 
 
-def _from_smp(file: _Checkpoint) -> Imported:
+def _from_smp(file: _Checkpoint) -> ImportedWeights:
     backbone = "mobilenet_v2" if "encoder.features.0.0.weight" in file.tensors else file.resnet("encoder.")
     names = file.class_names("segmentation_head.0.weight")
     architecture = torch_architecture(backbone, names, output_stride=file.stride)
@@ -352,14 +352,14 @@ def _from_smp(file: _Checkpoint) -> Imported:
     return file.convert(name, architecture, rows, ignored=("encoder.fc.", "encoder.classifier."))
 
 
-def _from_torchvision_deeplab(file: _Checkpoint) -> Imported:
+def _from_torchvision_deeplab(file: _Checkpoint) -> ImportedWeights:
     backbone, names = file.resnet("backbone."), file.class_names("classifier.4.bias")
     architecture = torchvision_architecture(backbone, names, output_stride=file.output_stride or 8)
     rows = [*torchvision_resnet(backbone, "backbone."), *torchvision_head(architecture)]
     return file.convert(f"torchvision DeepLabv3, {backbone}", architecture, rows, ignored=("aux_classifier.",))
 
 
-def _from_torch_backbone(file: _Checkpoint) -> Imported:
+def _from_torch_backbone(file: _Checkpoint) -> ImportedWeights:
     if "conv_stem.weight" in file.tensors:
         family, backbone, rows = "timm", "mobilenet_v2", list(timm_mobilenet_v2())
     else:
@@ -370,7 +370,7 @@ def _from_torch_backbone(file: _Checkpoint) -> Imported:
     return file.convert(f"{family} {backbone} backbone", architecture, rows, holds="backbone", ignored=ignored)
 
 
-def _from_tf_folded(file: _Checkpoint) -> Imported:
+def _from_tf_folded(file: _Checkpoint) -> ImportedWeights:
     if "logits_semantic/bias" in file.tensors:
         names = file.class_names("logits_semantic/bias")
         plain = tf_architecture("mobilenet_v2", names, output_stride=file.stride, decoder=False)
@@ -389,7 +389,7 @@ class _Source(NamedTuple):
 
     name: str
     recognise: Callable[[Tensors], bool]
-    convert: Callable[[_Checkpoint], Imported]
+    convert: Callable[[_Checkpoint], ImportedWeights]
 
 
 SOURCES = (

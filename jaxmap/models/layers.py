@@ -1,7 +1,6 @@
-"""The blocks that every network is made of, in Flax NNX; images are NHWC, kernels HWIO.
+"""Convolution blocks of all networks, in Flax NNX; images are NHWC, kernels HWIO.
 
-Blocks start with kernels of zeros: `deeplab.initial_weights` or a file fills them, which spares drawing what
-a file replaces.
+Kernels start as zeros, which `deeplab.initial_weights` or a file replaces.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
 from jaxmap.models.convolutions import WINOGRAD_MIN_CHANNELS, convolve, convolve_winograd
 
 BATCH_NORM_MOMENTUM = 0.9
-"""Weight of the old running statistics; torch calls the same 0.1."""
+"""Weight of the old running statistics; 0.1 in torch, which gives that of the new ones."""
 
 _NO_KEYS: Any = SimpleNamespace(params=lambda: None)
 """In place of `nnx.Rngs`: norms start as ones and zeros, and drawing keys for them took half the time of building."""
@@ -74,7 +73,7 @@ class ConvBlock(nnx.Module):
         return self.finish(images)
 
     def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
-        """What follows the convolution: bias or norm, then the activation."""
+        """Bias or norm, then the activation."""
         if self.bias is not None:
             return add_bias(images, self.bias[...], self.activation)
         if self.norm is not None:

@@ -6,8 +6,8 @@ A pickle is a program. It is never given to Python's own reader: the stack machi
 instructions that describe dicts of tensors, and refuses by name every function or class that is not a tensor's.
 Nothing is imported or called that the file asks for.
 
-A small program can name one value twice, that pair twice, and so on: what would walk through such a value
-(hashing it, printing it, copying it) never ends. So only text and numbers are keys, only names are called,
+A small program can name one value twice, that pair twice, and so on: walking through such a value
+(hashing, printing, copying) never ends. So only text and numbers are keys, only names are called,
 and no list is copied that the file can name again.
 """
 
@@ -210,7 +210,7 @@ def short(value: object) -> str:
 def _call(function: object, arguments: object) -> object:
     """The results of the few functions that describe tensors."""
     if not isinstance(function, _Global) or not isinstance(arguments, tuple):
-        raise Refused("the file asks to call what is no function")
+        raise Refused("the file asks to call something that is no function")
     name = str(function)
     if name == "collections.OrderedDict" and not arguments:
         return {}
