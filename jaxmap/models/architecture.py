@@ -187,7 +187,9 @@ def torchvision_architecture(backbone: str, classes: Sequence[str], *, output_st
 
 
 def _architecture(backbone: str, classes: Sequence[str], output_stride: int, **details: Any) -> Architecture:
-    return Architecture(backbone, tuple(classes), output_stride, **details)  # type: ignore[arg-type]
+    # By name, as errors then name the fields.
+    named: dict[str, Any] = {"backbone": backbone, "classes": tuple(classes), "output_stride": output_stride}
+    return Architecture(**named, **details)
 
 
 def folded(architecture: Architecture) -> Architecture:

@@ -1,4 +1,4 @@
-"""Every public form of weights is recognised and converted; whatever does not fit is told at once."""
+"""Every public form of weights is recognised and converted; all that does not fit is one error."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_names_agree_with_the_published_lists(realdata):
             assert {name: str(shape) for name, shape in ours.items()} == theirs
 
 
-def test_everything_wrong_is_told_in_one_error(tmp_path):
+def test_everything_wrong_is_one_error(tmp_path):
     architecture = torch_architecture("resnet18", ("a",))
     source = exported(architecture, list(tables.torchvision_backbone("resnet18")), tables.TORCH)
     del source["bn1.running_mean"]
