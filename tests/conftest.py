@@ -30,7 +30,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # placeholders for leaves, and shapes without arrays.
 FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model", "fusion.splat")
 NETWORK_MODULES = tuple(
-    f"models.{name}" for name in ("convolutions", "heads", "layers", "mobilenet_v2", "pixelwise", "resnet", "xception")
+    f"models.{name}" for name in ("backbones", "convolutions", "heads", "layers", "pixelwise", "resizing")
 )
 CHECKED_MODULES = (
     *FUSION_MODULES,

@@ -21,6 +21,9 @@ SMALL = replace(
     atrous_rates=(2,),
 )
 
+SEGMENTING = replace(SMALL, classes=("background", "sand", "rock"))
+"""The same for three classes."""
+
 
 @cache
 def small_model() -> SavedModel:

@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.errors import FrameError, JaxmapError, UsageError
-
-if TYPE_CHECKING:
-    from jaxmap.runs.segmentation import Segmenter
+from jaxmap.errors import JaxmapError, UsageError
 
 
 @dataclass(frozen=True)
@@ -21,8 +17,8 @@ class SegmentArguments:
     """Label images with a network.
 
     Writes NAME.png (class indices) and NAME_overlay.png for each image, at its own size and on its pixels
-    as they are stored: the rotation tag of a photograph is not applied. Inputs are never replaced; an image
-    that cannot be read is passed over, told, and makes the exit status 1.
+    as they are stored: the rotation tag of a photograph is not applied. Inputs are never replaced. An image
+    that cannot be read is skipped and reported at the end; the exit status is then 1.
     """
 
     images: tyro.conf.Positional[tuple[Path, ...]]
@@ -41,6 +37,9 @@ class SegmentArguments:
     """Write NAME_logits.npy too, float32 (H, W, classes)."""
 
 
+COLUMNS = {"name": "class", "iou": "IoU", "precision": "precision", "recall": "recall", "pixels": "true pixels"}
+
+
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(SegmentArguments, "segment", words)
@@ -51,7 +50,7 @@ def main(words: Sequence[str]) -> int:
 
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.models.checkpoint import load_network
-    from jaxmap.runs.segmentation import Segmenter, check_masks, check_outputs, find_images, find_masks
+    from jaxmap.runs.segmentation import Segmenter, check_masks, check_outputs, find_images, find_masks, label_images
 
     keep_compiled_programs()
     images = find_images(arguments.images)
@@ -62,30 +61,13 @@ def main(words: Sequence[str]) -> int:
     segmenter = Segmenter(model, arguments.size)
     if masks:
         check_masks(images, masks, len(segmenter.classes))
-    _label(arguments, segmenter, images, masks)
-    return 0
-
-
-def _label(arguments: SegmentArguments, segmenter: Segmenter, images: list[Path], masks: list[Path]) -> None:
-    """Labels, writes and scores all images; those that cannot be read are told at the end."""
-    from jaxmap.evaluation.segmentation_scores import SegmentationScores
-    from jaxmap.runs.segmentation import label_image, score_image, write_labelled
-
-    console, faults = Console(), []
-    scores = SegmentationScores.empty(segmenter.classes)
+    console = Console()
     with console.steps("labelling", "images", len(images)) as advance:
-        for index, image in enumerate(images):
-            try:
-                labelled = label_image(segmenter, image)
-            except FrameError as fault:
-                faults.append(fault)
-            else:
-                write_labelled(labelled, segmenter.classes, arguments.out, save_logits=arguments.save_logits)
-                if masks:
-                    score_image(scores, labelled, masks[index])
-            advance(index + 1)
+        scores, faults = label_images(
+            segmenter, images, arguments.out, masks=masks, save_logits=arguments.save_logits, advance=advance
+        )
     if masks:
-        _tell_scores(console, scores.summary(), arguments.scores)
+        _print_scores(console, scores.summary(), arguments.scores)
     if len(faults) < len(images):
         names = ["NAME.png", "NAME_overlay.png", *(["NAME_logits.npy"] * arguments.save_logits)]
         console.result(arguments.out, names)
@@ -95,28 +77,19 @@ def _label(arguments: SegmentArguments, segmenter: Segmenter, images: list[Path]
             where=faults[0].where,
             fix=faults[0].fix,
         )
+    return 0
 
 
-def _tell_scores(console: Console, summary: dict, file: Path | None) -> None:
+def _print_scores(console: Console, summary: dict, file: Path | None) -> None:
     from jaxmap.host.output_folder import write_json
 
-    console.table(_title(summary), COLUMNS, _rows(summary))
-    if file is not None:
-        write_json(file, summary)
-        console.notify(f"scores: {file}")
-
-
-COLUMNS = {"name": "class", "iou": "IoU", "precision": "precision", "recall": "recall", "pixels": "true pixels"}
-
-
-def _title(summary: dict) -> str:
-    figures = {"accuracy": "accuracy", "mean_iou": "mean IoU", "ece": "calibration error"}
-    told = [f"{heading} {summary[key]:.3f}" for key, heading in figures.items() if summary[key] is not None]
-    return f"{summary['images']} images: {', '.join(told) or 'no labelled pixel'}"
-
-
-def _rows(summary: dict) -> list[dict[str, object]]:
-    return [
+    headings = {"accuracy": "accuracy", "mean_iou": "mean IoU", "ece": "calibration error"}
+    figures = [f"{heading} {summary[key]:.3f}" for key, heading in headings.items() if summary[key] is not None]
+    rows = [
         {"name": name, **{key: "-" if value is None else value for key, value in values.items()}}
         for name, values in summary["classes"].items()
     ]
+    console.table(f"{summary['images']} images: {', '.join(figures) or 'no labelled pixel'}", COLUMNS, rows)
+    if file is not None:
+        write_json(file, summary)
+        console.notify(f"scores: {file}")

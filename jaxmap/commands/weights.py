@@ -37,7 +37,7 @@ class ImportArguments:
     classes: tuple[str, ...] | None = None
     """Names of its classes, in order."""
     output_stride: Literal[16, 8] | None = None
-    """The stride to run the network at, which checkpoints do not tell: 16, or 8 for torchvision's DeepLabv3."""
+    """The stride to run the network at, which checkpoints do not record: 16, or 8 for torchvision's DeepLabv3."""
 
 
 @dataclass(frozen=True)
@@ -65,20 +65,14 @@ def main(words: Sequence[str]) -> int:
         print(USAGE)
         return 0 if words else 2
     if words[0] == "import":
-        return _import(parse(ImportArguments, "weights import", words[1:]))
+        arguments = parse(ImportArguments, "weights import", words[1:])
+        return _convert(arguments.source, arguments)
     if words[0] == "fetch":
-        return _fetch(parse(FetchArguments, "weights fetch", words[1:]))
+        from jaxmap.runs.weights import fetch
+
+        asked = parse(FetchArguments, "weights fetch", words[1:])
+        return _convert(fetch(asked.name, mirror=asked.mirror, notify=Console().notify), asked)
     raise UsageError(f"there is no {words[0]!r}", where="jaxmap weights", fix="choose import or fetch")
-
-
-def _import(arguments: ImportArguments) -> int:
-    return _convert(arguments.source, arguments)
-
-
-def _fetch(arguments: FetchArguments) -> int:
-    from jaxmap.runs.weights import fetch
-
-    return _convert(fetch(arguments.name, mirror=arguments.mirror, notify=Console().notify), arguments)
 
 
 def _convert(source: Path, arguments: ImportArguments | FetchArguments) -> int:

@@ -1,8 +1,8 @@
 """Batch norm (Ioffe & Szegedy 2015) or a bias, with the activation that follows, and their gradients.
 
 The gradients are written by hand: what autodiff keeps of these few operations on every pixel (differences,
-masks, rescaled copies) is several times the images themselves, and reading it all costs more than computing.
-Only what enters is kept here, and the mask of the activation is found again from it.
+masks, rescaled copies) is several times the images themselves, and reading it costs more than computing.
+Here only the inputs are kept, and the mask of the activation is recomputed from them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _passes(values: Float[Array, "*shape"], activation: Activation) -> Bool[Arra
 
 
 def _masked(cotangent: Images, values: Images, activation: Activation) -> Images:
-    """The cotangent of what enters an activation."""
+    """The cotangent of the input of an activation."""
     return cotangent if activation == "none" else jnp.where(_passes(values, activation), cotangent, 0)
 
 
@@ -52,7 +52,7 @@ def _add_bias_forward(images: Images, bias: PerChannel, activation: Activation) 
 
 
 def _add_bias_backward(activation: Activation, result: Images | None, cotangent: Images) -> tuple[Images, PerChannel]:
-    # The result passes where what entered the activation does.
+    # The result passes where the input of the activation does.
     masked = cotangent if result is None else _masked(cotangent, result, activation)
     return masked, masked.sum(_PIXELS)
 

@@ -1,4 +1,4 @@
-"""Model files: one `.safetensors` that says what network its weights belong to.
+"""Model files: one `.safetensors` with the weights of a network and the record of its architecture.
 
 The metadata key `jaxmap` holds JSON: `format_version`, `architecture` (the fields of `Architecture`),
 `classes`, `normalisation` and `holds` (`network`, or `backbone` where the rest is still to be trained).
@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
-from jaxmap.models.architecture import Architecture, check_architecture
+from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, weight_shapes
 from jaxmap.models.tensor_files import as_float32, read_safetensors, shortened
 from jaxmap.types import to_device
@@ -29,11 +28,11 @@ FORMAT_VERSION = 1
 Holds = Literal["network", "backbone"]
 
 _ELSEWHERE = {"classes", "mean", "std"}
-"""Fields of `Architecture` that stand beside it in the file, where other programs look for them."""
+"""Fields of `Architecture` that are stored beside it in the file, where other programs look for them."""
 
 
 class SavedModel(NamedTuple):
-    """What a model file holds.
+    """The content of a model file.
 
     Attributes:
         architecture: the network.
@@ -52,12 +51,11 @@ def save_model(
     """Writes a model file atomically.
 
     Raises:
-        JaxmapError: no such network can be built, the weights are not its own, or writing failed.
+        JaxmapError: the weights are not those of the network, or writing failed.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
-    check_architecture(architecture, path)
     arrays = {name: as_float32(np.asarray(value)) for name, value in weights.items()}
     check_weights(architecture, arrays, holds=holds, where=path)
     fields = dataclasses.asdict(architecture)
@@ -72,7 +70,7 @@ def save_model(
         try:
             save_file(arrays, temporary, metadata={"jaxmap": json.dumps(record)})
         except SafetensorError as error:
-            # The library wraps what the operating system has said.
+            # The library wraps the operating system's error.
             code = errno.ENOSPC if "os error 28" in str(error) else errno.EIO
             raise OSError(code, str(error)) from error
 
@@ -114,7 +112,7 @@ def check_weights(
     """Compares weights with what an architecture needs.
 
     Raises:
-        JaxmapError: weights are missing, left over, misshapen or not finite; all are told together.
+        JaxmapError: weights are missing, left over, misshapen or not finite; all are reported together.
     """
     expected = weight_shapes(architecture)
     if holds == "backbone":
@@ -145,7 +143,7 @@ def raise_mismatch(
     where: object,
     fix: str,
 ) -> None:
-    """Raises one error that tells all differences, or does nothing where there is none.
+    """Raises one error that lists all differences, or does nothing where there is none.
 
     Raises:
         JaxmapError: a list is not empty.
@@ -176,22 +174,15 @@ def _read_record(metadata: dict[str, str], path: Path) -> tuple[Architecture, Ho
             )
         fields = dict(record["architecture"], classes=record["classes"])
         fields.update((name, record["normalisation"][name]) for name in ("mean", "std"))
-        unknown = sorted(set(fields) - {field.name for field in dataclasses.fields(Architecture)})
-        if unknown:
-            raise ValueError(f"unknown fields {unknown[:6]}")
         holds = record.get("holds", "network")
         if holds not in get_args(Holds):
             raise ValueError(f"holds is {holds!r}")
-        architecture = TypeAdapter(Architecture).validate_python(fields)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as fault:
+        reason = f"{type(fault).__name__}: {' '.join(str(fault).split())[:120]}"
         raise JaxmapError(
-            f"the metadata key jaxmap is damaged ({_reason(fault)})", where=path, fix="write the model file anew"
+            f"the metadata key jaxmap is damaged ({reason})", where=path, fix="write the model file anew"
         ) from fault
-    return check_architecture(architecture, path), holds
-
-
-def _reason(fault: Exception) -> str:
-    if isinstance(fault, ValidationError):
-        first = fault.errors()[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    return f"{type(fault).__name__}: {' '.join(str(fault).split())[:120]}"
+    try:
+        return Architecture(**fields), holds
+    except JaxmapError as fault:
+        raise JaxmapError(fault.what, where=path, fix=fault.fix) from fault

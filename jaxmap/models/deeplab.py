@@ -13,14 +13,12 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, UInt8
 
-from jaxmap.models.architecture import Architecture, check_architecture, folded
-from jaxmap.models.convolutions import resize_bilinear
+from jaxmap.models.architecture import Architecture, folded
+from jaxmap.models.backbones import RESNET_UNITS, MobileNetV2, ResNet, Xception65
+from jaxmap.models.convolutions import winograd_kernel
 from jaxmap.models.heads import Aspp, Decoder
 from jaxmap.models.layers import ConvBlock
-from jaxmap.models.mobilenet_v2 import MobileNetV2
-from jaxmap.models.resnet import ResNet
-from jaxmap.models.winograd import transformed_kernel
-from jaxmap.models.xception import Xception65
+from jaxmap.models.resizing import resize_bilinear
 from jaxmap.types import to_device
 
 Weights = dict[str, Array]
@@ -34,9 +32,7 @@ Images = UInt8[Array, "B H W 3"] | Float[Array, "B H W 3"]
 
 _BACKBONES: dict[str, Callable[[Architecture], MobileNetV2 | ResNet | Xception65]] = {
     "mobilenet_v2": MobileNetV2,
-    "resnet18": ResNet,
-    "resnet50": ResNet,
-    "resnet101": ResNet,
+    **dict.fromkeys(RESNET_UNITS, ResNet),
     "xception65": Xception65,
 }
 
@@ -89,12 +85,8 @@ def normalise(images: Images, record: Architecture) -> Float[Array, "B h w 3"]:
 
 
 def make_network(architecture: Architecture, key: PRNGKeyArray) -> DeepLab:
-    """A network with random weights, in evaluation mode.
-
-    Raises:
-        JaxmapError: no such network can be built.
-    """
-    return _filled(_skeleton(check_architecture(architecture)), initial_weights(architecture, key))
+    """A network with random weights, in evaluation mode."""
+    return _filled(_skeleton(architecture), initial_weights(architecture, key))
 
 
 @cache
@@ -131,7 +123,7 @@ class PureNetwork(NamedTuple):
     """A network as a pure function and its weights.
 
     Attributes:
-        architecture: what it is.
+        architecture: the network.
         weights: its arrays by dotted path; a pytree.
         apply: `(weights, images) -> logits`, not yet jitted.
         apply_coarse: the same for `DeepLab.coarse_logits`.
@@ -144,11 +136,12 @@ class PureNetwork(NamedTuple):
 
 
 def pure_form(network: DeepLab) -> PureNetwork:
-    """Splits a network once, so that its calls cost no Python when they are jitted."""
-    return _pure_form(network.record, network_weights(network))
+    """The pure form of a network: its calls cost no Python when they are jitted."""
+    return pure_network(network.record, network_weights(network))
 
 
-def _pure_form(architecture: Architecture, weights: Weights) -> PureNetwork:
+def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
+    """The pure form of a network with given weights, which must be complete."""
     skeleton = _skeleton(architecture)
 
     def apply(weights: Weights, images: Images) -> Array:
@@ -157,7 +150,8 @@ def _pure_form(architecture: Architecture, weights: Weights) -> PureNetwork:
     def apply_coarse(weights: Weights, images: Images) -> Array:
         return _filled(skeleton, weights).coarse_logits(images)
 
-    return PureNetwork(architecture, weights, apply, apply_coarse)
+    arrays = {name: value if isinstance(value, Array) else to_device(value) for name, value in weights.items()}
+    return PureNetwork(architecture, arrays, apply, apply_coarse)
 
 
 def training_form(
@@ -203,12 +197,6 @@ def weight_shapes(architecture: Architecture) -> Mapping[str, tuple[int, ...]]:
     return MappingProxyType({name: tuple(leaf.shape) for name, leaf in shapes.items()})
 
 
-def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
-    """The pure form of a network with given weights, which must be complete."""
-    arrays = {name: value if isinstance(value, Array) else to_device(value) for name, value in weights.items()}
-    return _pure_form(architecture, arrays)
-
-
 def fold_batch_norm(
     architecture: Architecture, weights: Mapping[str, AnyArray]
 ) -> tuple[Architecture, dict[str, AnyArray]]:
@@ -230,14 +218,14 @@ def fold_batch_norm(
 
 
 def inference_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -> PureNetwork:
-    """The network in the form that computes logits fastest; its weights are neither to be trained nor to be kept.
+    """The network in the form that computes logits fastest; its weights are not for training or for model files.
 
-    Batch norm is folded, and on a CPU the kernels of large dense convolutions are transformed (`winograd`).
+    Batch norm is folded, and on a CPU the kernels of large dense convolutions are transformed (`convolve_winograd`).
     """
     architecture, result = fold_batch_norm(architecture, {name: np.asarray(value) for name, value in weights.items()})
     if jax.default_backend() == "cpu":
         for path, block in nnx.iter_modules(_skeleton(architecture)):
             if isinstance(block, ConvBlock) and block.transformable:
                 name = ".".join(map(str, (*path, "kernel")))
-                result[name] = transformed_kernel(jnp.asarray(result[name]))
+                result[name] = winograd_kernel(jnp.asarray(result[name]))
     return pure_network(architecture, result)

@@ -1,8 +1,12 @@
-"""Converts published weights to our names and layouts, by the tables of `import_tables`."""
+"""Published weights, converted to our names and layouts by tables.
+
+A row of a table states which convolution and which norm of the source fill one of our blocks. Rows are generated for
+every backbone and head; a `Naming` states how a source spells and lays out the arrays of a block.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -12,16 +16,13 @@ import numpy as np
 
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
-from jaxmap.models import import_tables as tables
-from jaxmap.models.architecture import (
-    Architecture,
-    tf_architecture,
-    torch_architecture,
-    torchvision_architecture,
-)
+from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture, torchvision_architecture
+from jaxmap.models.backbones import MOBILENET_STAGES, RESNET_UNITS
 from jaxmap.models.checkpoint import Holds, raise_mismatch
 from jaxmap.models.deeplab import weight_shapes
 from jaxmap.models.tensor_files import Tensors, as_float32, read_tensors, shortened
+
+DEFAULT_STRIDE = 16
 
 VOC_CLASSES: tuple[str, ...] = (
     *("background", "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow"),
@@ -30,11 +31,11 @@ VOC_CLASSES: tuple[str, ...] = (
 """Pascal VOC's classes in the order of its label images."""
 
 
-class Imported(NamedTuple):
-    """What an importer made.
+class ImportedWeights(NamedTuple):
+    """A converted checkpoint.
 
     Attributes:
-        source: what the file was recognised as.
+        source: the kind of file that was recognised.
         architecture: the network; for a backbone alone, a network that it fits.
         weights: float32 arrays by our dotted paths.
         holds: whether it is a whole network or a backbone.
@@ -46,26 +47,15 @@ class Imported(NamedTuple):
     holds: Holds
 
 
-class _Source(NamedTuple):
-    """A kind of weight file: what it is called, how to tell it, and how to convert it."""
-
-    name: str
-    recognise: Callable[[Tensors], bool]
-    convert: Callable[[Tensors, Sequence[str] | None, int | None, Path], Imported]
-
-
-DEFAULT_STRIDE = 16
-
-
 def import_weights(
     path: str | PathLike[str], *, classes: Sequence[str] | None = None, output_stride: int | None = None
-) -> Imported:
+) -> ImportedWeights:
     """Reads a public checkpoint and converts it.
 
     Args:
         path: `.safetensors`, or a PyTorch zip.
         classes: names of its classes in order; Pascal VOC's where there are 21, else `class_0` and on.
-        output_stride: the stride to run the network at, which weights do not tell; without it 8 for
+        output_stride: the stride to run the network at, which weights do not record; without it 8 for
             torchvision's DeepLabv3, as it was trained, and 16 for all others.
 
     Raises:
@@ -73,12 +63,19 @@ def import_weights(
             the network it looks like (everything missing, left over or misshapen in one error).
     """
     path = Path(path)
-    tensors = _without_prefix(read_tensors(path))
+    tensors = read_tensors(path)
+    # Wrappers put these before every name.
+    for prefix in ("module.", "model."):
+        if tensors and all(name.startswith(prefix) for name in tensors):
+            tensors = {name.removeprefix(prefix): value for name, value in tensors.items()}
     if "backbone.stem.kernel" in tensors or "backbone.stem.0.kernel" in tensors:
         raise JaxmapError("already a model file of jaxmap's", where=path, fix="use it as it is")
     for source in SOURCES:
         if source.recognise(tensors):
-            return source.convert(tensors, classes, output_stride, path)
+            try:
+                return source.convert(_Checkpoint(path, tensors, classes, output_stride))
+            except JaxmapError as fault:
+                raise JaxmapError(fault.what, where=path, fix=fault.fix) from fault
     raise JaxmapError(
         f"weights of no known kind (there is {shortened(list(tensors), 2) or 'nothing'})",
         where=path,
@@ -86,44 +83,151 @@ def import_weights(
     )
 
 
-def _without_prefix(tensors: Tensors) -> Tensors:
-    """Without the `module.` or `model.` that wrappers put before every name."""
-    for prefix in ("module.", "model."):
-        if tensors and all(name.startswith(prefix) for name in tensors):
-            tensors = {name.removeprefix(prefix): value for name, value in tensors.items()}
-    return tensors
+class Row(NamedTuple):
+    """One block: its path, its convolution and its norm in the source (None where there is none)."""
+
+    block: str
+    convolution: str
+    norm: str | None = None
 
 
-def _resnet_of(tensors: Tensors, prefix: str, where: Path) -> str:
-    units = tuple(
-        sum(f"{prefix}layer{stage}.{unit}.conv1.weight" in tensors for unit in range(64)) for stage in (1, 2, 3, 4)
-    )
-    bottleneck = f"{prefix}layer1.0.conv3.weight" in tensors
-    for name, expected in tables.RESNET_UNITS.items():
-        if units == expected and bottleneck == (name != "resnet18"):
-            return name
-    kind = "bottleneck" if bottleneck else "basic"
-    raise JaxmapError(
-        f"a ResNet of {'+'.join(map(str, units))} {kind} units",
-        where=where,
-        fix=f"known are {', '.join(tables.RESNET_UNITS)}",
-    )
+class Naming(NamedTuple):
+    """How a source spells and lays out the arrays of a block.
+
+    Attributes:
+        kernel: suffix of the kernel.
+        bias: suffix of the convolution's bias.
+        norm: suffix of each array of a norm, by our name.
+        transpose: axes that turn the source's kernels into HWIO.
+        ignored: endings of names that are no weights.
+    """
+
+    kernel: str
+    bias: str
+    norm: dict[str, str]
+    transpose: tuple[int, int, int, int]
+    ignored: tuple[str, ...]
 
 
-def _class_names(count: int, given: Sequence[str] | None, where: Path) -> tuple[str, ...]:
-    if given is not None:
-        if len(given) != count:
-            raise JaxmapError(
-                f"{len(given)} classes are named, the network has {count}", where=where, fix="name all in order"
-            )
-        return tuple(given)
-    return VOC_CLASSES if count == len(VOC_CLASSES) else tuple(f"class_{index}" for index in range(count))
+TORCH = Naming(
+    ".weight",
+    ".bias",
+    {"scale": ".weight", "bias": ".bias", "mean": ".running_mean", "var": ".running_var"},
+    (2, 3, 1, 0),
+    (".num_batches_tracked",),
+)
+TENSORFLOW = Naming("/kernel", "/bias", {}, (0, 1, 2, 3), ())
+
+
+def torchvision_mobilenet_v2(prefix: str = "") -> Iterator[Row]:
+    """`features.N` of torchvision (and of segmentation_models_pytorch, under `encoder.`)."""
+    yield Row("backbone.stem", f"{prefix}features.0.0", f"{prefix}features.0.1")
+    for unit, expansion in enumerate(_mobilenet_expansions()):
+        source = f"{prefix}features.{unit + 1}.conv"
+        names = ["depthwise"] if expansion == 1 else ["expand", "depthwise"]
+        for place, name in enumerate(names):
+            yield Row(f"backbone.units.{unit}.{name}", f"{source}.{place}.0", f"{source}.{place}.1")
+        yield Row(f"backbone.units.{unit}.project", f"{source}.{len(names)}", f"{source}.{len(names) + 1}")
+    yield Row("backbone.top", f"{prefix}features.18.0", f"{prefix}features.18.1")
+
+
+def timm_mobilenet_v2(prefix: str = "") -> Iterator[Row]:
+    """`mobilenetv2_100` of timm: `blocks.STAGE.UNIT.{conv_pw,conv_dw,conv_pwl}`."""
+    yield Row("backbone.stem", f"{prefix}conv_stem", f"{prefix}bn1")
+    place = 0
+    for stage, (expansion, _, count, _) in enumerate(MOBILENET_STAGES):
+        names = (
+            {"depthwise": "conv_dw", "project": "conv_pw"}
+            if expansion == 1
+            else {"expand": "conv_pw", "depthwise": "conv_dw", "project": "conv_pwl"}
+        )
+        for unit in range(count):
+            source = f"{prefix}blocks.{stage}.{unit}"
+            for index, (ours, theirs) in enumerate(names.items()):
+                yield Row(f"backbone.units.{place}.{ours}", f"{source}.{theirs}", f"{source}.bn{index + 1}")
+            place += 1
+    yield Row("backbone.top", f"{prefix}conv_head", f"{prefix}bn2")
+
+
+def torchvision_resnet(backbone: str, prefix: str = "") -> Iterator[Row]:
+    """`layerN.UNIT.convM`, the names of torchvision, timm and segmentation_models_pytorch alike."""
+    yield Row("backbone.stem", f"{prefix}conv1", f"{prefix}bn1")
+    convolutions = 2 if backbone == "resnet18" else 3
+    for stage, count in enumerate(RESNET_UNITS[backbone]):
+        for unit in range(count):
+            ours, theirs = f"backbone.stages.{stage}.{unit}", f"{prefix}layer{stage + 1}.{unit}"
+            for index in range(convolutions):
+                yield Row(f"{ours}.convs.{index}", f"{theirs}.conv{index + 1}", f"{theirs}.bn{index + 1}")
+            # ResNet-18 keeps the channels of its first stage; all others start with a projection.
+            if unit == 0 and not (backbone == "resnet18" and stage == 0):
+                yield Row(f"{ours}.shortcut", f"{theirs}.downsample.0", f"{theirs}.downsample.1")
+
+
+def torchvision_backbone(backbone: str, prefix: str = "") -> Iterator[Row]:
+    """The rows of a backbone under torchvision's names."""
+    if backbone == "mobilenet_v2":
+        return torchvision_mobilenet_v2(prefix)
+    return torchvision_resnet(backbone, prefix)
+
+
+def smp_head(architecture: Architecture) -> Iterator[Row]:
+    """Decoder and head of segmentation_models_pytorch's DeepLabV3Plus."""
+    aspp = "decoder.aspp.0"
+    yield Row("aspp.point", f"{aspp}.convs.0.0", f"{aspp}.convs.0.1")
+    rates = len(architecture.atrous_rates)
+    for index in range(rates):
+        source = f"{aspp}.convs.{index + 1}"
+        yield Row(f"aspp.atrous.{index}.depthwise", f"{source}.0.0")
+        yield Row(f"aspp.atrous.{index}.pointwise", f"{source}.0.1", f"{source}.1")
+    yield Row("aspp.pool", f"{aspp}.convs.{rates + 1}.1", f"{aspp}.convs.{rates + 1}.2")
+    yield Row("aspp.project", f"{aspp}.project.0", f"{aspp}.project.1")
+    yield Row("aspp.refine.depthwise", "decoder.aspp.1.0")
+    yield Row("aspp.refine.pointwise", "decoder.aspp.1.1", "decoder.aspp.2")
+    yield Row("decoder.reduce", "decoder.block1.0", "decoder.block1.1")
+    yield Row("decoder.refine.0.depthwise", "decoder.block2.0.0")
+    yield Row("decoder.refine.0.pointwise", "decoder.block2.0.1", "decoder.block2.1")
+    yield Row("classifier", "segmentation_head.0")
+
+
+def torchvision_head(architecture: Architecture) -> Iterator[Row]:
+    """The classifier of torchvision's `deeplabv3_resnet50` and `deeplabv3_resnet101`."""
+    aspp, rates = "classifier.0", len(architecture.atrous_rates)
+    yield Row("aspp.point", f"{aspp}.convs.0.0", f"{aspp}.convs.0.1")
+    for index in range(rates):
+        yield Row(f"aspp.atrous.{index}", f"{aspp}.convs.{index + 1}.0", f"{aspp}.convs.{index + 1}.1")
+    yield Row("aspp.pool", f"{aspp}.convs.{rates + 1}.1", f"{aspp}.convs.{rates + 1}.2")
+    yield Row("aspp.project", f"{aspp}.project.0", f"{aspp}.project.1")
+    yield Row("aspp.refine", "classifier.1", "classifier.2")
+    yield Row("classifier", "classifier.4")
+
+
+def tf_folded_mobilenet_v2(*, top: bool) -> Iterator[Row]:
+    """`expanded_conv_N/{expand,depthwise,project}` of slim, batch norm folded."""
+    yield Row("backbone.stem", "Conv")
+    for unit, expansion in enumerate(_mobilenet_expansions()):
+        source = f"expanded_conv_{unit}" if unit else "expanded_conv"
+        for name in ("expand", "depthwise", "project") if expansion > 1 else ("depthwise", "project"):
+            yield Row(f"backbone.units.{unit}.{name}", f"{source}/{name}")
+    if top:
+        yield Row("backbone.top", "Conv_1")
+
+
+def tf_folded_head() -> Iterator[Row]:
+    """DeepLabv3 without atrous branches and decoder, as the original publishes it on MobileNetV2."""
+    yield Row("aspp.pool", "image_pooling")
+    yield Row("aspp.point", "aspp0")
+    yield Row("aspp.project", "concat_projection")
+    yield Row("classifier", "logits_semantic")
+
+
+def _mobilenet_expansions() -> list[int]:
+    return [expansion for expansion, _, count, _ in MOBILENET_STAGES for _ in range(count)]
 
 
 def convert(
     tensors: Tensors,
-    rows: Sequence[tables.Row],
-    naming: tables.Naming,
+    rows: Sequence[Row],
+    naming: Naming,
     architecture: Architecture,
     *,
     holds: Holds,
@@ -139,17 +243,24 @@ def convert(
         architecture: what the result must fit.
         holds: whether the whole network is expected, or only its backbone.
         where: the file, for the error.
-        ignored: starts of names in the source that are left out knowingly (an ImageNet classifier).
+        ignored: starts of names in the source that are left out deliberately (an ImageNet classifier).
 
     Raises:
         JaxmapError: names are missing or left over, or shapes are wrong; all in one error.
     """
-    by_block = {row.block: row for row in rows}
+    sources: dict[str, str] = {}
+    for row in rows:
+        sources |= {
+            f"{row.block}.kernel": row.convolution + naming.kernel,
+            f"{row.block}.bias": row.convolution + naming.bias,
+        }
+        if row.norm is not None:
+            sources |= {f"{row.block}.norm.{leaf}": row.norm + suffix for leaf, suffix in naming.norm.items()}
     missing, misshapen, used, result = [], [], set(), {}
     for name, shape in weight_shapes(architecture).items():
         if holds == "backbone" and not name.startswith("backbone."):
             continue
-        source = _source_name(name, by_block, naming)
+        source = sources.get(name)
         if source is None or source not in tensors:
             missing.append(source or f"a counterpart of {name}")
             continue
@@ -178,95 +289,107 @@ def convert(
     return result
 
 
-def _source_name(name: str, by_block: dict[str, tables.Row], naming: tables.Naming) -> str | None:
-    block, _, leaf = name.rpartition(".")
-    if block.endswith(".norm"):
-        row = by_block.get(block.removesuffix(".norm"))
-        return None if row is None or row.norm is None else row.norm + naming.norm[leaf]
-    row = by_block.get(block)
-    return None if row is None else row.convolution + (naming.kernel if leaf == "kernel" else naming.bias)
+class _Checkpoint(NamedTuple):
+    """A file that was read, and the wishes of the user."""
 
+    path: Path
+    tensors: Tensors
+    classes: Sequence[str] | None
+    output_stride: int | None
 
-def _from_smp(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
-    mobile = "encoder.features.0.0.weight" in tensors
-    backbone = "mobilenet_v2" if mobile else _resnet_of(tensors, "encoder.", path)
-    head = tensors.get("segmentation_head.0.weight")
-    names = _class_names(len(head) if head is not None and head.ndim else 1, classes, path)
-    architecture = torch_architecture(backbone, names, output_stride=stride or DEFAULT_STRIDE, where=path)
-    rows = [*tables.torchvision_backbone(backbone, "encoder."), *tables.smp_head(architecture)]
-    weights = convert(
-        tensors,
-        rows,
-        tables.TORCH,
-        architecture,
-        holds="network",
-        where=path,
-        ignored=("encoder.fc.", "encoder.classifier."),
-    )
-    return Imported(f"segmentation_models_pytorch DeepLabV3Plus, {backbone}", architecture, weights, "network")
+    @property
+    def stride(self) -> int:
+        return self.output_stride or DEFAULT_STRIDE
 
+    def class_names(self, classifier: str) -> tuple[str, ...]:
+        """Names for the outputs of the classifier, whose kernel or bias is the tensor of that name."""
+        found = self.tensors.get(classifier)
+        count = len(found) if found is not None and found.ndim else 1
+        if self.classes is None:
+            return VOC_CLASSES if count == len(VOC_CLASSES) else tuple(f"class_{index}" for index in range(count))
+        if len(self.classes) != count:
+            raise JaxmapError(
+                f"{len(self.classes)} classes are named, the network has {count}", fix="name all in order"
+            )
+        return tuple(self.classes)
 
-def _from_torchvision_deeplab(
-    tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path
-) -> Imported:
-    backbone = _resnet_of(tensors, "backbone.", path)
-    head = tensors.get("classifier.4.bias")
-    names = _class_names(1 if head is None else head.size, classes, path)
-    architecture = torchvision_architecture(backbone, names, output_stride=stride or 8, where=path)
-    rows = [*tables.torchvision_resnet(backbone, "backbone."), *tables.torchvision_head(architecture)]
-    weights = convert(
-        tensors, rows, tables.TORCH, architecture, holds="network", where=path, ignored=("aux_classifier.",)
-    )
-    return Imported(f"torchvision DeepLabv3, {backbone}", architecture, weights, "network")
-
-
-def _from_torchvision(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
-    mobile = "features.0.0.weight" in tensors
-    backbone = "mobilenet_v2" if mobile else _resnet_of(tensors, "", path)
-    return _torch_backbone(
-        "torchvision", backbone, list(tables.torchvision_backbone(backbone)), tensors, classes, stride, path
-    )
-
-
-def _from_timm(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
-    return _torch_backbone("timm", "mobilenet_v2", list(tables.timm_mobilenet_v2()), tensors, classes, stride, path)
-
-
-def _torch_backbone(
-    family: str,
-    backbone: str,
-    rows: list[tables.Row],
-    tensors: Tensors,
-    classes: Sequence[str] | None,
-    stride: int | None,
-    path: Path,
-) -> Imported:
-    architecture = torch_architecture(
-        backbone, classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path
-    )
-    weights = convert(
-        tensors, rows, tables.TORCH, architecture, holds="backbone", where=path, ignored=("classifier.", "fc.")
-    )
-    return Imported(f"{family} {backbone} backbone", architecture, weights, "backbone")
-
-
-def _from_tf_folded(tensors: Tensors, classes: Sequence[str] | None, stride: int | None, path: Path) -> Imported:
-    if "logits_semantic/bias" in tensors:
-        names = _class_names(tensors["logits_semantic/bias"].size, classes, path)
-        plain = tf_architecture(
-            "mobilenet_v2", names, output_stride=stride or DEFAULT_STRIDE, decoder=False, where=path
+    def resnet(self, prefix: str = "") -> str:
+        """Which ResNet has the units that are found under a prefix."""
+        units = tuple(
+            sum(f"{prefix}layer{stage}.{unit}.conv1.weight" in self.tensors for unit in range(64))
+            for stage in (1, 2, 3, 4)
         )
+        bottleneck = f"{prefix}layer1.0.conv3.weight" in self.tensors
+        for name, expected in RESNET_UNITS.items():
+            if units == expected and bottleneck == (name != "resnet18"):
+                return name
+        kind = "bottleneck" if bottleneck else "basic"
+        raise JaxmapError(
+            f"a ResNet of {'+'.join(map(str, units))} {kind} units", fix=f"known are {', '.join(RESNET_UNITS)}"
+        )
+
+    def convert(
+        self,
+        source: str,
+        architecture: Architecture,
+        rows: Sequence[Row],
+        *,
+        naming: Naming = TORCH,
+        holds: Holds = "network",
+        ignored: Sequence[str] = (),
+    ) -> ImportedWeights:
+        """Converts the tensors; see `convert` of this module."""
+        weights = convert(self.tensors, rows, naming, architecture, holds=holds, where=self.path, ignored=ignored)
+        return ImportedWeights(source, architecture, weights, holds)
+
+
+def _from_smp(file: _Checkpoint) -> ImportedWeights:
+    backbone = "mobilenet_v2" if "encoder.features.0.0.weight" in file.tensors else file.resnet("encoder.")
+    names = file.class_names("segmentation_head.0.weight")
+    architecture = torch_architecture(backbone, names, output_stride=file.stride)
+    rows = [*torchvision_backbone(backbone, "encoder."), *smp_head(architecture)]
+    name = f"segmentation_models_pytorch DeepLabV3Plus, {backbone}"
+    return file.convert(name, architecture, rows, ignored=("encoder.fc.", "encoder.classifier."))
+
+
+def _from_torchvision_deeplab(file: _Checkpoint) -> ImportedWeights:
+    backbone, names = file.resnet("backbone."), file.class_names("classifier.4.bias")
+    architecture = torchvision_architecture(backbone, names, output_stride=file.output_stride or 8)
+    rows = [*torchvision_resnet(backbone, "backbone."), *torchvision_head(architecture)]
+    return file.convert(f"torchvision DeepLabv3, {backbone}", architecture, rows, ignored=("aux_classifier.",))
+
+
+def _from_torch_backbone(file: _Checkpoint) -> ImportedWeights:
+    if "conv_stem.weight" in file.tensors:
+        family, backbone, rows = "timm", "mobilenet_v2", list(timm_mobilenet_v2())
+    else:
+        backbone = "mobilenet_v2" if "features.0.0.weight" in file.tensors else file.resnet()
+        family, rows = "torchvision", list(torchvision_backbone(backbone))
+    architecture = torch_architecture(backbone, file.classes or ROVER_CLASSES, output_stride=file.stride)
+    ignored = ("classifier.", "fc.")
+    return file.convert(f"{family} {backbone} backbone", architecture, rows, holds="backbone", ignored=ignored)
+
+
+def _from_tf_folded(file: _Checkpoint) -> ImportedWeights:
+    if "logits_semantic/bias" in file.tensors:
+        names = file.class_names("logits_semantic/bias")
+        plain = tf_architecture("mobilenet_v2", names, output_stride=file.stride, decoder=False)
         architecture = replace(plain, backbone_norm=False, head_norm=False)
-        rows = [*tables.tf_folded_mobilenet_v2(top=False), *tables.tf_folded_head()]
-        weights = convert(tensors, rows, tables.TENSORFLOW, architecture, holds="network", where=path)
-        return Imported("TensorFlow DeepLabv3, mobilenet_v2, folded", architecture, weights, "network")
-    plain = tf_architecture(
-        "mobilenet_v2", classes or ROVER_CLASSES, output_stride=stride or DEFAULT_STRIDE, where=path
-    )
+        rows = [*tf_folded_mobilenet_v2(top=False), *tf_folded_head()]
+        return file.convert("TensorFlow DeepLabv3, mobilenet_v2, folded", architecture, rows, naming=TENSORFLOW)
+    plain = tf_architecture("mobilenet_v2", file.classes or ROVER_CLASSES, output_stride=file.stride)
     architecture = replace(plain, top_conv=True, backbone_norm=False)
-    rows = list(tables.tf_folded_mobilenet_v2(top=True))
-    weights = convert(tensors, rows, tables.TENSORFLOW, architecture, holds="backbone", where=path)
-    return Imported("TensorFlow mobilenet_v2 backbone, folded", architecture, weights, "backbone")
+    rows = list(tf_folded_mobilenet_v2(top=True))
+    name = "TensorFlow mobilenet_v2 backbone, folded"
+    return file.convert(name, architecture, rows, naming=TENSORFLOW, holds="backbone")
+
+
+class _Source(NamedTuple):
+    """A kind of weight file: its name, how it is recognised, and how it is converted."""
+
+    name: str
+    recognise: Callable[[Tensors], bool]
+    convert: Callable[[_Checkpoint], ImportedWeights]
 
 
 SOURCES = (
@@ -280,11 +403,11 @@ SOURCES = (
         lambda tensors: "classifier.0.convs.0.0.weight" in tensors and "backbone.conv1.weight" in tensors,
         _from_torchvision_deeplab,
     ),
-    _Source("timm mobilenetv2_100", lambda tensors: "conv_stem.weight" in tensors, _from_timm),
+    _Source("timm mobilenetv2_100", lambda tensors: "conv_stem.weight" in tensors, _from_torch_backbone),
     _Source(
         "torchvision (or timm) resnet18, resnet50, resnet101, mobilenet_v2",
         lambda tensors: "features.0.0.weight" in tensors or "layer1.0.conv1.weight" in tensors,
-        _from_torchvision,
+        _from_torch_backbone,
     ),
     _Source("TensorFlow folded mobilenet_v2 and DeepLabv3", lambda tensors: "Conv/kernel" in tensors, _from_tf_folded),
 )

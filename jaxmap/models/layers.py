@@ -1,7 +1,6 @@
-"""The blocks that every network is made of, in Flax NNX; images are NHWC, kernels HWIO.
+"""Convolution blocks of all networks, in Flax NNX; images are NHWC, kernels HWIO.
 
-Blocks start with kernels of zeros: `deeplab.initial_weights` or a file fills them, which spares drawing what
-a file replaces.
+Kernels start as zeros, which `deeplab.initial_weights` or a file replaces.
 """
 
 from __future__ import annotations
@@ -15,11 +14,10 @@ from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Activation, Norm, Padding
 from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
-from jaxmap.models.convolutions import convolve
-from jaxmap.models.winograd import MIN_CHANNELS, convolve_transformed
+from jaxmap.models.convolutions import WINOGRAD_MIN_CHANNELS, convolve, convolve_winograd
 
 BATCH_NORM_MOMENTUM = 0.9
-"""Weight of the old running statistics; torch calls the same 0.1."""
+"""Weight of the old running statistics; 0.1 in torch, which gives that of the new ones."""
 
 _NO_KEYS: Any = SimpleNamespace(params=lambda: None)
 """In place of `nnx.Rngs`: norms start as ones and zeros, and drawing keys for them took half the time of building."""
@@ -30,7 +28,7 @@ class ConvBlock(nnx.Module):
 
     Weights: `kernel` (K, K, I, O), or (K, K, 1, C) depthwise; `norm.{scale,bias,mean,var}` (O,) where
     `norm` is `batch`, `bias` (O,) where it is `bias`. For inference, the kernel of a `transformable` block may be the
-    (4, 4, I, O) that `winograd.transformed_kernel` makes of it.
+    (4, 4, I, O) that `winograd_kernel` makes of it.
     """
 
     def __init__(
@@ -62,7 +60,7 @@ class ConvBlock(nnx.Module):
         """Applies the block."""
         kernel = self.kernel[...]
         if kernel.shape[0] != self.size:
-            images = convolve_transformed(images, kernel, self.dilation)
+            images = convolve_winograd(images, kernel, self.dilation)
         else:
             images = convolve(
                 images,
@@ -75,7 +73,7 @@ class ConvBlock(nnx.Module):
         return self.finish(images)
 
     def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
-        """What follows the convolution: bias or norm, then the activation."""
+        """Bias or norm, then the activation."""
         if self.bias is not None:
             return add_bias(images, self.bias[...], self.activation)
         if self.norm is not None:
@@ -86,7 +84,7 @@ class ConvBlock(nnx.Module):
     def transformable(self) -> bool:
         """Whether the kernel may be transformed, and the block becomes faster by it."""
         plain = self.size == 3 and self.stride == 1 and not self.depthwise
-        return plain and min(self.kernel.shape[2:]) >= MIN_CHANNELS
+        return plain and min(self.kernel.shape[2:]) >= WINOGRAD_MIN_CHANNELS
 
 
 class SeparableBlock(nnx.Module):
@@ -126,29 +124,3 @@ class SeparableBlock(nnx.Module):
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the block."""
         return self.pointwise(self.depthwise(images))
-
-
-def dilations(strides: list[int], start: int, output_stride: int, dilate_first: bool) -> list[tuple[int, int]]:
-    """Strides and dilations of units in a row, such that the features end at `output_stride`.
-
-    Strides beyond it become dilation: of that unit already where `dilate_first`, else from the next
-    one on (which leaves the field of view of the unit itself as it was trained).
-
-    Args:
-        strides: of the units, as designed.
-        start: input pixels for each pixel that enters the first unit.
-        output_stride: input pixels for each feature wanted.
-        dilate_first: see `Architecture`.
-
-    Returns:
-        (stride, dilation) of every unit.
-    """
-    result, reached, rate = [], start, 1
-    for stride in strides:
-        if reached * stride <= output_stride:
-            reached *= stride
-            result.append((stride, rate))
-        else:
-            result.append((1, rate * stride if dilate_first else rate))
-            rate *= stride
-    return result

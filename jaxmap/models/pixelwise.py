@@ -1,7 +1,6 @@
-"""What a network says of every pixel of an image, without ever holding all class logits at its full size.
+"""From an image to the input of a network, and from its logits back to all pixels of the image.
 
-An image passes through a network at the network's own size or at one that is given, and its logits come
-back to the pixels of the image: `segment` and the labeller of the compiled step both do so by this file.
+`segment` and the labeller of the compiled step both use this; the labeller never holds the logits of all pixels.
 """
 
 from __future__ import annotations
@@ -16,8 +15,9 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from jaxmap.errors import UsageError
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.convolutions import PRECISION, resize_bilinear, resize_rows
+from jaxmap.models.convolutions import PRECISION
 from jaxmap.models.deeplab import Images, padded_size
+from jaxmap.models.resizing import resize_bilinear, resize_rows
 
 Size = tuple[int, int]
 """Height and width in pixels."""
@@ -27,7 +27,7 @@ _BLOCK_COLUMNS = 128
 
 
 def check_size(size_px: Size | None, where: object) -> None:
-    """Refuses a size that no image can have.
+    """Refuses an invalid size.
 
     Raises:
         UsageError: the height or the width is below 1.

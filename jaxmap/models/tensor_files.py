@@ -1,4 +1,4 @@
-"""Reading the tensors of weight files, trusting nothing that they say."""
+"""Reading the tensors of weight files, which are not trusted."""
 
 from __future__ import annotations
 
@@ -43,13 +43,19 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], Tensors]:
     try:
         with safe_open(path, framework="numpy") as file:
             types = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
-            _refuse_types(types, path)
+            wrong = [f"{name} is {kind}" for name, kind in types.items() if kind not in _FLOATS and kind[0] not in "IU"]
+            if wrong:
+                raise JaxmapError(
+                    f"tensors of a type that is not read: {shortened(wrong)}",
+                    where=path,
+                    fix="save the weights as float32",
+                )
             tensors = {name: file.get_tensor(name) for name, kind in types.items() if kind in _FLOATS}
             return dict(file.metadata() or {}), tensors
     except (SafetensorError, ValueError, MemoryError) as fault:
         # NumPy has its own limits: a tensor of more than 64 axes is well-formed, but no array.
         raise JaxmapError(
-            f"not a whole safetensors file ({_reason(fault)})",
+            f"not a whole safetensors file ({' '.join(str(fault).split())[:120]})",
             where=path,
             fix="it may be truncated: copy or download it again",
         ) from fault
@@ -57,28 +63,13 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], Tensors]:
         raise JaxmapError(f"cannot be read ({fault.strerror or fault})", where=path, fix="check the file") from fault
 
 
-def _refuse_types(types: dict[str, str], path: Path) -> None:
-    wrong = [
-        f"{name} is {kind}" for name, kind in types.items() if kind not in _FLOATS and not kind.startswith(("I", "U"))
-    ]
-    if wrong:
-        raise JaxmapError(
-            f"tensors of a type that is not read: {shortened(wrong)}", where=path, fix="save the weights as float32"
-        )
-
-
-def _reason(fault: Exception) -> str:
-    return " ".join(str(fault).split())[:120]
-
-
 def shortened(items: Sequence[str], at_most: int = 3, length: int = 100) -> str:
     """The first of them, each cut to `length`, and how many more there are."""
     more = f" and {len(items) - at_most} more" if len(items) > at_most else ""
-    told = (item if len(item) <= length else f"{item[:length]}..." for item in items[:at_most])
-    return ", ".join(told) + more
+    return ", ".join(item if len(item) <= length else f"{item[:length]}..." for item in items[:at_most]) + more
 
 
 def as_float32(array: np.ndarray) -> np.ndarray:
-    """The array in float32; what is too large for it becomes infinite, and is told with what is not finite."""
+    """The array in float32; what is too large for it becomes infinite, and is reported with what is not finite."""
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(array, np.float32)

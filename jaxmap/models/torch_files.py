@@ -1,27 +1,52 @@
 """PyTorch's zip files of tensors, read without unpickling.
 
-Such a zip holds `NAME/data.pkl`, a pickle that says which tensors there are, and `NAME/data/KEY`, their raw
-numbers. The pickle is never given to Python's own reader: see `torch_program`.
+Such a zip holds `NAME/data.pkl`, a pickle that describes the tensors, and `NAME/data/KEY`, their raw numbers.
+
+A pickle is a program. It is never given to Python's own reader: the stack machine below interprets only the few
+instructions that describe dicts of tensors, and refuses by name every function or class that is not a tensor's.
+Nothing is imported or called that the file asks for.
+
+A small program can name one value twice, that pair twice, and so on: walking through such a value
+(hashing, printing, copying) never ends. So only text and numbers are keys, only names are called,
+and no list is copied that the file can name again.
 """
 
 from __future__ import annotations
 
 import math
+import pickletools
 import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models.torch_program import Refused, StoredTensor, interpret, short
 
 MAX_PROGRAM_BYTES = 4 * 2**20
 """A description takes some 200 bytes for each tensor."""
 MAX_SHARING = 4
 """Tensors may share numbers, but not so that a small file fills the memory."""
+MAX_AXES = 16
 
 _WRAPPERS = ("state_dict", "model_state_dict", "model", "net", "network")
 _ZIP_START = b"PK\x03\x04"
+
+_STORAGES = {
+    "DoubleStorage": "f8",
+    "FloatStorage": "f4",
+    "HalfStorage": "f2",
+    "LongStorage": "i8",
+    "IntStorage": "i4",
+    "ShortStorage": "i2",
+    "CharStorage": "i1",
+    "ByteStorage": "u1",
+    "BoolStorage": "?",
+}
+_FUNCTIONS = ("collections.OrderedDict", "torch._utils._rebuild_parameter", "torch._utils._rebuild_tensor_v2")
+_MARK = object()
 
 
 def read_torch_zip(path: Path) -> dict[str, np.ndarray]:
@@ -53,7 +78,7 @@ def read_torch_zip(path: Path) -> dict[str, np.ndarray]:
             str(fault), where=path, fix="save only the state dict, best as safetensors: safetensors.torch.save_file"
         ) from fault
     except Exception as fault:
-        # There is no end of what damaged bytes make the parsers raise.
+        # Damaged bytes make the parsers raise any exception.
         reason = " ".join(str(fault)[:1000].split())[:120] or type(fault).__name__
         raise JaxmapError(f"a broken PyTorch file ({reason})", where=path, fix="copy or download it again") from fault
     if not tensors:
@@ -81,7 +106,7 @@ def _read(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, np.ndarray]:
         if isinstance(name, str) and isinstance(value, StoredTensor) and "f" in value.storage.dtype:
             if (size := value.storage.bytes) > file_bytes:
                 raise Refused(
-                    f"storage {short(value.storage.key)} is said to hold {short(size)} bytes, the file is smaller"
+                    f"storage {short(value.storage.key)} should hold {short(size)} bytes, the file is smaller"
                 )
             total += value.check()
             if total > MAX_SHARING * file_bytes:
@@ -120,3 +145,188 @@ def _materialise(
     strides = [step * dtype.itemsize for step in tensor.strides]
     view = np.lib.stride_tricks.as_strided(numbers[tensor.offset :], tensor.shape, strides)
     return view.astype(dtype.newbyteorder("="))
+
+
+@dataclass(frozen=True)
+class _Global:
+    """A function or class that the file names."""
+
+    module: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.module}.{self.name}"
+
+
+@dataclass(frozen=True)
+class Storage:
+    """The numbers of one or more tensors, not read yet."""
+
+    key: str
+    dtype: str
+    count: int
+
+    @property
+    def bytes(self) -> int:
+        """The size that the file declares."""
+        return self.count * np.dtype(self.dtype).itemsize
+
+
+class Refused(Exception):
+    """The file holds something other than a dict of tensors."""
+
+
+@dataclass(frozen=True)
+class StoredTensor:
+    """A view of a storage, as the file describes it."""
+
+    storage: Storage
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def check(self) -> int:
+        """The bytes it takes.
+
+        Raises:
+            Refused: it does not lie inside its storage.
+        """
+        whole = (*self.shape, *self.strides, self.offset)
+        if not all(isinstance(value, int) and value >= 0 for value in whole) or len(self.shape) != len(self.strides):
+            raise Refused("a tensor of impossible shape")
+        count = math.prod(self.shape)
+        last = self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.strides, strict=True))
+        if count and (last >= self.storage.count or count > self.storage.count):
+            raise Refused(f"a tensor of shape {short(list(self.shape))} in a storage of fewer numbers")
+        return count * np.dtype(self.storage.dtype).itemsize
+
+
+def short(value: object) -> str:
+    """At most 80 characters of a value of the file; only for text, numbers and lists of numbers."""
+    text = str(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."
+
+
+def _call(function: object, arguments: object) -> object:
+    """The results of the few functions that describe tensors."""
+    if not isinstance(function, _Global) or not isinstance(arguments, tuple):
+        raise Refused("the file asks to call something that is no function")
+    name = str(function)
+    if name == "collections.OrderedDict" and not arguments:
+        return {}
+    if name == "torch._utils._rebuild_parameter" and arguments:
+        return arguments[0]
+    if name == "torch._utils._rebuild_tensor_v2" and len(arguments) >= 4:
+        storage, offset, shape, strides = arguments[:4]
+        if not isinstance(storage, Storage):
+            raise Refused("a tensor without a storage")
+        if not isinstance(shape, tuple) or not isinstance(strides, tuple) or len(shape) > MAX_AXES:
+            raise Refused("a tensor of impossible shape")
+        return StoredTensor(storage, offset, shape, strides)
+    raise Refused(f"the file asks to call {name} in another way than PyTorch does, which is refused")
+
+
+def _named(module: object, name: object) -> _Global:
+    if not isinstance(module, str) or not isinstance(name, str):
+        raise Refused("a name that is no text")
+    found = _Global(module, name)
+    if str(found) not in _FUNCTIONS and not (module == "torch" and name in _STORAGES):
+        raise Refused(f"the file asks for {short(found)}, which is refused")
+    return found
+
+
+def _storage(identity: object) -> Storage:
+    if not isinstance(identity, tuple) or len(identity) != 5 or identity[0] != "storage":
+        raise Refused("a reference that is no storage")
+    kind, key, count = identity[1], identity[2], identity[4]
+    if not isinstance(kind, _Global) or kind.name not in _STORAGES:
+        raise Refused("a reference that is no storage")
+    if not isinstance(key, str) or not isinstance(count, int) or count < 0:
+        raise Refused("a reference that is no storage")
+    return Storage(key, _STORAGES[kind.name], count)
+
+
+def interpret(program: bytes) -> object:
+    """Runs the description of a dict of tensors on a stack of plain values.
+
+    Raises:
+        Refused: it asks for anything else.
+    """
+    stack: list[Any] = []
+    memo: dict[int, object] = {}
+    for opcode, argument, _ in pickletools.genops(program):
+        name = opcode.name
+        if name == "STOP":
+            return stack.pop()
+        if name in _IGNORED:
+            continue
+        if name in _PUSHED:
+            stack.append(argument)
+        elif name in _MADE:
+            stack.append(_MADE[name]())
+        elif name in ("BINPUT", "LONG_BINPUT", "PUT"):
+            memo[int(argument)] = stack[-1]  # type: ignore[arg-type]
+        elif name == "MEMOIZE":
+            memo[len(memo)] = stack[-1]
+        elif name in ("BINGET", "LONG_BINGET", "GET"):
+            stack.append(memo[int(argument)])  # type: ignore[arg-type]
+        elif name == "GLOBAL":
+            stack.append(_named(*str(argument).split(" ", 1)))
+        elif name in _STACK_STEPS:
+            _STACK_STEPS[name](stack)
+        else:
+            raise Refused(f"the file uses the pickle instruction {name}, which is refused")
+    raise Refused("a description without an end")
+
+
+def _popped(stack: list, count: int) -> list:
+    values = stack[len(stack) - count :]
+    del stack[len(stack) - count :]
+    return values
+
+
+def _since_mark(stack: list) -> list:
+    values = _popped(stack, next(back for back, value in enumerate(reversed(stack)) if value is _MARK))
+    stack.pop()
+    return values
+
+
+def _set_items(stack: list, values: list) -> None:
+    if not all(isinstance(key, str | int | float) for key in values[::2]):
+        raise Refused("a dict whose keys are neither text nor numbers")
+    stack[-1].update(zip(values[::2], values[1::2], strict=True))
+
+
+def _extend(stack: list, values: list) -> None:
+    stack[-1].extend(values)
+
+
+_IGNORED = {"PROTO", "FRAME"}
+_PUSHED = {
+    *("BINUNICODE", "SHORT_BINUNICODE", "UNICODE", "BINUNICODE8", "SHORT_BINSTRING", "BINSTRING"),
+    *("BININT", "BININT1", "BININT2", "INT", "LONG", "LONG1", "BINFLOAT", "FLOAT"),
+}
+_MADE: dict[str, Callable[[], object]] = {
+    "MARK": lambda: _MARK,
+    "EMPTY_DICT": dict,
+    "EMPTY_LIST": list,
+    "EMPTY_TUPLE": tuple,
+    "NONE": lambda: None,
+    "NEWTRUE": lambda: True,
+    "NEWFALSE": lambda: False,
+}
+_STACK_STEPS: dict[str, Callable[[list], None]] = {
+    "SETITEM": lambda stack: _set_items(stack, _popped(stack, 2)),
+    "SETITEMS": lambda stack: _set_items(stack, _since_mark(stack)),
+    "APPEND": lambda stack: _extend(stack, _popped(stack, 1)),
+    "APPENDS": lambda stack: _extend(stack, _since_mark(stack)),
+    "TUPLE": lambda stack: stack.append(tuple(_since_mark(stack))),
+    "TUPLE1": lambda stack: stack.append(tuple(_popped(stack, 1))),
+    "TUPLE2": lambda stack: stack.append(tuple(_popped(stack, 2))),
+    "TUPLE3": lambda stack: stack.append(tuple(_popped(stack, 3))),
+    "REDUCE": lambda stack: stack.append(_call(*_popped(stack, 2))),
+    "BINPERSID": lambda stack: stack.append(_storage(stack.pop())),
+    "STACK_GLOBAL": lambda stack: stack.append(_named(*_popped(stack, 2))),
+    # The state of an OrderedDict is PyTorch's version notes, which are no tensors.
+    "BUILD": lambda stack: stack.pop(),
+}

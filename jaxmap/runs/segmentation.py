@@ -1,10 +1,9 @@
-"""Labels images with a network: finds them, runs it, writes what comes out, scores it."""
+"""Labels images with a network: finds the images, labels them, writes and scores the labels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -12,7 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from jaxmap.datasets.images import as_rgb, list_images, read_image, read_index_image
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.host.files import atomic_path
 from jaxmap.models.checkpoint import SavedModel
@@ -61,14 +60,6 @@ class Segmenter:
             raise
 
 
-class Labelled(NamedTuple):
-    """One image and what the network says of it."""
-
-    source: Path
-    image: UInt8[np.ndarray, "H W *rgb"]
-    logits: Float[np.ndarray, "H W C"]
-
-
 def find_images(sources: Sequence[Path]) -> list[Path]:
     """Image files, those of folders in the natural order of their names.
 
@@ -93,23 +84,28 @@ def find_images(sources: Sequence[Path]) -> list[Path]:
 
 
 def check_outputs(images: Sequence[Path], out: Path, *, inputs: Sequence[Path], scores: Path | None) -> None:
-    """Refuses outputs that would replace each other or anything that is read.
+    """Refuses outputs that would replace each other or an input.
 
     Args:
-        images: what is labelled.
-        out: the folder that is written.
+        images: files to label.
+        out: the folder to write.
         inputs: files that are only read: images, masks, model.
-        scores: a file that is written as well.
+        scores: a file to write as well.
 
     Raises:
-        JaxmapError: an output has the place of an input, or two have one name, or what should be a
-            folder is a file.
+        JaxmapError: an output would replace an input or another output, or `out` is a file.
     """
     if out.exists() and not out.is_dir():
         raise JaxmapError("cannot be made: it is a file", where=out, fix="choose another --out")
     if scores is not None and scores.is_dir():
         raise JaxmapError("cannot be written: it is a folder", where=scores, fix="choose another --scores")
-    read = {_identity(path) for path in inputs}
+
+    def identity(path: Path) -> tuple[int, int]:
+        """The same for all names of a file."""
+        found = path.stat()
+        return found.st_dev, found.st_ino
+
+    read = {identity(path) for path in inputs}
     names = {f"{image.stem}.png" for image in images}
     written = [out / name for name in names] + ([] if scores is None else [scores])
     for image in images:
@@ -122,21 +118,15 @@ def check_outputs(images: Sequence[Path], out: Path, *, inputs: Sequence[Path], 
             )
         written.append(out / overlay)
     for path in sorted(written):
-        if path.exists() and _identity(path) in read:
+        if path.exists() and identity(path) in read:
             raise JaxmapError(f"{path.name} would be replaced, and it is an input", where=path, fix="write elsewhere")
-
-
-def _identity(path: Path) -> tuple[int, int]:
-    """The same for all names of a file."""
-    found = path.stat()
-    return found.st_dev, found.st_ino
 
 
 def find_masks(images: Sequence[Path], folder: Path) -> list[Path]:
     """The mask `NAME.png` of every image.
 
     Raises:
-        JaxmapError: masks are missing; they are told together.
+        JaxmapError: masks are missing; all are named.
     """
     masks = [folder / f"{image.stem}.png" for image in images]
     missing = [mask.name for mask in masks if not mask.is_file()]
@@ -149,35 +139,8 @@ def find_masks(images: Sequence[Path], folder: Path) -> list[Path]:
     return masks
 
 
-def label_image(segmenter: Segmenter, path: Path) -> Labelled:
-    """Reads an image and labels it.
-
-    Raises:
-        FrameError: the image cannot be read.
-        JaxmapError: it is too large for the memory.
-    """
-    image = read_image(path)
-    return Labelled(path, image, segmenter.logits(image))
-
-
-def write_labelled(labelled: Labelled, classes: Sequence[str], out: Path, *, save_logits: bool) -> None:
-    """Writes `NAME.png`, `NAME_overlay.png` and, where asked, `NAME_logits.npy`, each atomically.
-
-    Raises:
-        JaxmapError: writing failed.
-    """
-    labels = labelled.logits.argmax(axis=-1).astype(np.uint8)
-    name = labelled.source.stem
-    for suffix, picture in (("", labels), ("_overlay", overlay_labels(labelled.image, labels, classes))):
-        with atomic_path(out / f"{name}{suffix}.png") as temporary:
-            Image.fromarray(picture).save(temporary)
-    if save_logits:
-        with atomic_path(out / f"{name}_logits.npy") as temporary:
-            np.save(temporary, labelled.logits.astype(np.float32))
-
-
 def check_masks(images: Sequence[Path], masks: Sequence[Path], class_count: int) -> None:
-    """Reads every mask once before the long work starts.
+    """Reads every mask once, before the long work starts.
 
     Raises:
         JaxmapError: a mask that cannot be read, of another size than its image, or with wrong labels.
@@ -186,10 +149,48 @@ def check_masks(images: Sequence[Path], masks: Sequence[Path], class_count: int)
         check_mask(read_index_image(mask), read_image(image).shape[:2], class_count, mask)
 
 
-def score_image(scores: SegmentationScores, labelled: Labelled, mask: Path) -> None:
-    """Counts one labelled image.
+def label_images(
+    segmenter: Segmenter,
+    images: Sequence[Path],
+    out: Path,
+    *,
+    masks: Sequence[Path] = (),
+    save_logits: bool = False,
+    advance: Callable[[int], None] = lambda done: None,
+) -> tuple[SegmentationScores, list[FrameError]]:
+    """Labels images and writes `NAME.png`, `NAME_overlay.png` and, if asked, `NAME_logits.npy`, each atomically.
+
+    Args:
+        segmenter: the network.
+        images: files to label.
+        out: the folder to write.
+        masks: the true labels of each image, or none.
+        save_logits: whether the logits are written as well.
+        advance: takes the number of images done so far.
+
+    Returns:
+        The scores against the masks, and the errors of images that cannot be read.
 
     Raises:
-        JaxmapError: the mask does not fit.
+        JaxmapError: an image is too large for the memory, a mask does not fit, or writing failed.
     """
-    scores.add(read_index_image(mask), labelled.logits, mask)
+    scores, faults = SegmentationScores.empty(segmenter.classes), []
+    for index, path in enumerate(images):
+        try:
+            image = read_image(path)
+        except FrameError as fault:
+            faults.append(fault)
+        else:
+            logits = segmenter.logits(image)
+            labels = logits.argmax(axis=-1).astype(np.uint8)
+            overlay = overlay_labels(image, labels, segmenter.classes)
+            for suffix, picture in (("", labels), ("_overlay", overlay)):
+                with atomic_path(out / f"{path.stem}{suffix}.png") as temporary:
+                    Image.fromarray(picture).save(temporary)
+            if save_logits:
+                with atomic_path(out / f"{path.stem}_logits.npy") as temporary:
+                    np.save(temporary, logits.astype(np.float32))
+            if masks:
+                scores.add(read_index_image(masks[index]), logits, masks[index])
+        advance(index + 1)
+    return scores, faults

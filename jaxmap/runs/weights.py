@@ -1,4 +1,4 @@
-"""Public pretrained weights: where they lie, how they are checked, and how they become model files."""
+"""Public pretrained weights: downloaded, checked, and converted to model files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.cache import cache_folder
 from jaxmap.models.checkpoint import save_model
-from jaxmap.models.importers import Imported, import_weights
+from jaxmap.models.importers import ImportedWeights, import_weights
 
 TIMEOUT_S = 60.0
 
@@ -20,7 +20,7 @@ class PublicWeights(NamedTuple):
     Attributes:
         url: where it lies.
         sha256: its checksum, or as many leading digits of it as are known.
-        help: what it holds.
+        help: its content in words.
     """
 
     url: str
@@ -75,14 +75,14 @@ PUBLIC: dict[str, PublicWeights] = {
 }
 """What `jaxmap weights fetch` knows, by name.
 
-The publisher tells the first eight digits of each SHA-256, in the file's name. The other digits are those
-that at least two projects which have nothing to do with each other have published for the same file.
+The publisher gives the first eight digits of each SHA-256, in the file's name. The other digits are those
+that at least two independent projects have published for the same file.
 """
 
 
 def convert_file(
     source: Path, out: Path, *, classes: Sequence[str] | None = None, output_stride: int | None = None
-) -> Imported:
+) -> ImportedWeights:
     """Converts a public checkpoint to a model file; the arguments are those of `import_weights`.
 
     Raises:

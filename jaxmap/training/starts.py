@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 
 from jaxmap.errors import UsageError
-from jaxmap.models.architecture import Architecture, check_architecture, tf_architecture, torch_architecture
+from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import Weights, initial_weights
 from jaxmap.models.tensor_files import shortened
@@ -98,19 +98,19 @@ def _architecture(
 ) -> Architecture:
     chosen = {name: value for name in _CHOICES if (value := getattr(options, name)) is not None}
     if init is None:
-        return check_architecture(dataclasses.replace(_of_family(options, classes), **chosen), "network")
+        return dataclasses.replace(_of_family(options, classes), **chosen)
     trained = init.architecture
     if options.backbone not in (None, trained.backbone):
         raise UsageError(
             f"the file holds {trained.backbone}, not {options.backbone}", where=where, fix="leave out network.backbone"
         )
     if init.holds == "network" and options.family is None:
-        return check_architecture(dataclasses.replace(trained, classes=classes, **chosen), where)
+        return dataclasses.replace(trained, classes=classes, **chosen)
     family = options.family or ("tf" if trained.padding == "same" else "torch")
     stride = options.output_stride or trained.output_stride
     asked = dataclasses.replace(options, backbone=trained.backbone, family=family, output_stride=stride)
     kept = {name: getattr(trained, name) for name in _BACKBONE_FIELDS}
-    return check_architecture(dataclasses.replace(_of_family(asked, classes), **{**kept, **chosen}), where)
+    return dataclasses.replace(_of_family(asked, classes), **{**kept, **chosen})
 
 
 def _of_family(options: NetworkOptions, classes: tuple[str, ...]) -> Architecture:

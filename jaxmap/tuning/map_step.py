@@ -25,8 +25,8 @@ from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.deeplab import Weights, training_form
+from jaxmap.models.resizing import resize_bilinear
 from jaxmap.training.options import TrainingOptions
 from jaxmap.training.step import StepInfo, TrainState, make_updater, parted
 from jaxmap.tuning.frame_crops import FrameBatch, crop_frame, points_per_pixel, widest_camera

@@ -115,7 +115,7 @@ class Scored:
     """A map and the truth below it.
 
     Attributes:
-        class_map: the map as rock is scored in it.
+        class_layer: the map as rock is scored in it.
         raster: the truth.
     """
 

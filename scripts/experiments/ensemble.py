@@ -74,7 +74,7 @@ def main() -> None:
             plan, voxel_map, step_ms = fused(frames, config)
             result = Scored(plan, voxel_map, traverse.truth)
             layers = ensemble_layers(voxel_map, plan.params.fusion, plan.rule)
-            result.class_map = replace(result.class_map, ensemble=np.asarray(layers.probability))
+            result.class_layer = replace(result.class_layer, ensemble=np.asarray(layers.probability))
             scores = result.scores["ensemble"]
             if spread == given.spreads[0]:
                 without = [scores["map_alone"][key] for key in SCORES]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import zlib
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,11 @@ def seeded_image(height: int, width: int) -> np.ndarray:
 
 def seeded_weights(architecture) -> dict[str, np.ndarray]:
     """Weights of one of our own networks, by our names."""
+    return dict(_seeded_weights(architecture))
+
+
+@lru_cache(maxsize=3)
+def _seeded_weights(architecture) -> dict[str, np.ndarray]:
     from jaxmap.models.deeplab import weight_shapes
 
     def tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -69,9 +75,9 @@ def seeded_weights(architecture) -> dict[str, np.ndarray]:
     return {name: tensor(name, shape) for name, shape in weight_shapes(architecture).items()}
 
 
-def exported(architecture, rows, naming) -> dict[str, np.ndarray]:
-    """Seeded weights of ours as the source would name and lay them out."""
-    weights, result = seeded_weights(architecture), {}
+def exported(architecture, rows, naming, weights=None) -> dict[str, np.ndarray]:
+    """Weights of ours, by default the seeded ones, as the source would name and lay them out."""
+    weights, result = seeded_weights(architecture) if weights is None else weights, {}
     back = np.argsort(naming.transpose)
     for row in rows:
         result[row.convolution + naming.kernel] = np.ascontiguousarray(weights[f"{row.block}.kernel"].transpose(back))

@@ -1,106 +1,237 @@
-"""`jaxmap segment` and `jaxmap weights`: from a checkpoint to labelled and scored images."""
+"""`jaxmap segment`: labelled and scored images, of odd kinds, sizes and names, and what it refuses."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-import re
-import threading
+import unicodedata
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from fixtures import cli, shared_cache  # noqa: F401
-from golden.seeded_weights import exported, seeded_image, seeded_weights
+from golden.seeded_weights import seeded_image, seeded_weights
+from networks import SEGMENTING
 from PIL import Image
-from safetensors.numpy import save_file
 
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
-from jaxmap.models import import_tables as tables
-from jaxmap.models.architecture import torch_architecture
-from jaxmap.models.checkpoint import load_model, save_model
-from jaxmap.runs import weights as weight_files
+from jaxmap.models.architecture import tf_architecture
+from jaxmap.models.checkpoint import SavedModel, load_network, save_model
+from jaxmap.runs import segmentation
 
-SMALL = replace(
-    torch_architecture("mobilenet_v2", ("background", "sand", "rock")),
-    top_conv=False,
-    head_channels=8,
-    low_level_channels=4,
-    atrous_rates=(2,),
-)
+SIZE = (40, 56)
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.safetensors"
-    save_model(path, SMALL, seeded_weights(SMALL))
+    save_model(path, SEGMENTING, seeded_weights(SEGMENTING))
     return path
 
 
 @pytest.fixture
-def images(tmp_path):
+def picture() -> Image.Image:
+    return Image.fromarray(seeded_image(*SIZE))
+
+
+@pytest.fixture
+def images(tmp_path, picture):
     folder = tmp_path / "images"
     folder.mkdir()
-    Image.fromarray(seeded_image(40, 56)).save(folder / "a.png")
-    Image.fromarray(seeded_image(40, 56)[..., 0]).save(folder / "b.png")
+    picture.save(folder / "a.png")
+    picture.convert("L").save(folder / "b.png")
     (folder / "notes.txt").write_text("no image")
     return folder
 
 
-def labels_of(path):
+def labels_of(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         return np.array(image)
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
 def test_images_are_labelled_and_scored(cli, model, images, tmp_path):
+    """The network runs at another size; labels and logits have that of the image."""
     out = tmp_path / "out"
-    assert cli("segment", images, "--model", model, "--out", out, "--save-logits").status == 0
+    words = ("segment", images, "--model", model, "--out", out, "--size", "17", "50")
+    assert cli(*words, "--save-logits").status == 0
     assert sorted(path.name for path in out.iterdir()) == sorted(
         f"{name}{end}" for name in "ab" for end in (".png", "_overlay.png", "_logits.npy")
     )
     logits = np.load(out / "a_logits.npy")
-    assert logits.shape == (40, 56, 3) and logits.dtype == np.float32
+    assert logits.shape == (*SIZE, 3) and logits.dtype == np.float32
     np.testing.assert_array_equal(labels_of(out / "a.png"), logits.argmax(axis=-1))
-    assert labels_of(out / "a_overlay.png").shape == (40, 56, 3)
+    assert labels_of(out / "a_overlay.png").shape == (*SIZE, 3)
     (tmp_path / "masks").mkdir()
     for name in "ab":
         mask = labels_of(out / f"{name}.png")
         mask[:3] = 255
         Image.fromarray(mask).save(tmp_path / "masks" / f"{name}.png")
-    words = ("segment", images, "--model", model, "--out", out, "--masks", tmp_path / "masks")
-    outcome = cli(*words, "--scores", tmp_path / "scores.json")
+    outcome = cli(*words, "--masks", tmp_path / "masks", "--scores", tmp_path / "scores.json")
     assert outcome.status == 0 and "IoU" in outcome.out
     scores = json.loads((tmp_path / "scores.json").read_text())
-    assert scores["accuracy"] == 1.0 and scores["images"] == 2 and scores["pixels"] == 2 * 37 * 56
-    assert set(scores["classes"]) == set(SMALL.classes)
+    assert scores["accuracy"] == 1.0 and scores["images"] == 2 and scores["pixels"] == 2 * 37 * SIZE[1]
+    assert set(scores["classes"]) == set(SEGMENTING.classes)
     assert {"iou", "precision", "recall"} <= set(scores["classes"]["rock"])
 
 
-def test_a_given_size_still_labels_every_pixel(cli, model, images, tmp_path):
-    words = ("segment", images / "a.png", "--model", model, "--out", tmp_path / "out", "--size", "32", "48")
+def sixteen_bits(picture: Image.Image) -> Image.Image:
+    return Image.fromarray(np.asarray(picture.convert("L")).astype(np.uint16) * 257)
+
+
+KINDS = {
+    "rgb.png": lambda picture: picture,
+    "grey.png": lambda picture: picture.convert("L"),
+    "grey_alpha.png": lambda picture: picture.convert("LA"),
+    "rgba.png": lambda picture: picture.convert("RGBA"),
+    "palette.png": lambda picture: picture.convert("P"),
+    "two_colours.png": lambda picture: picture.convert("1"),
+    "deep.png": sixteen_bits,
+    "photograph.jpg": lambda picture: picture,
+    "print.tif": lambda picture: picture.convert("CMYK"),
+    "LOUD.PNG": lambda picture: picture,
+}
+NAMES = ("Ωmega æ", "岩石 01", "a.b.c", "[x]{y}*", "'; rm -rf", "%s %d", "e\u0301")
+
+
+def test_every_kind_and_name_of_image_is_labelled(cli, model, picture, tmp_path):
+    folder, out = tmp_path / "[岩石] %s" / "images", tmp_path / "[岩石] %s" / "out"
+    folder.mkdir(parents=True)
+    for name, convert in KINDS.items():
+        convert(picture).save(folder / name)
+    for name in NAMES:
+        picture.save(folder / f"{name}.png")
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    picture.save(folder / "turned.jpg", exif=turned)
+    (folder / "._a.png").write_bytes(b"resource fork")
+    before = contents(folder)
+    outcome = cli("segment", folder, "--model", model, "--out", out)
+    assert outcome.status == 0 and str(out) in outcome.out and contents(folder) == before
+    stems = [*(Path(name).stem for name in KINDS), *NAMES, "turned"]
+    assert {unicodedata.normalize("NFC", path.name) for path in out.iterdir()} == {
+        unicodedata.normalize("NFC", f"{stem}{end}") for stem in stems for end in (".png", "_overlay.png")
+    }
+    labels = {stem: labels_of(out / f"{stem}.png") for stem in stems}
+    assert {array.shape for array in labels.values()} == {SIZE}
+    # 16 bits go down to 8 by a shift: the same picture again. Labels lie on the pixels as they are stored.
+    alike = {"rgba": "rgb", "LOUD": "rgb", "a.b.c": "rgb", "grey_alpha": "grey", "deep": "grey", "turned": "photograph"}
+    for one, other in alike.items():
+        np.testing.assert_array_equal(labels[one], labels[other], err_msg=one)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(1, 1), (1, 50), (10, 5000), (17, 3)])
+@pytest.mark.parametrize("given", [None, (33, 47)])
+def test_any_size_is_labelled_at_its_own_size(model, size, given):
+    logits = segmentation.Segmenter(load_network(model), given).logits(seeded_image(*size))
+    assert logits.shape == (*size, 3) and np.isfinite(logits).all()
+
+
+@pytest.mark.slow
+def test_one_pixel_is_enough_for_the_tensorflow_design():
+    record = replace(tf_architecture("mobilenet_v2", ("a", "b")), head_channels=8, low_level_channels=4)
+    weights = {name: jax.numpy.asarray(value) for name, value in seeded_weights(record).items()}
+    segmenter = segmentation.Segmenter(SavedModel(record, weights, "network"))
+    assert np.isfinite(segmenter.logits(seeded_image(1, 1))).all()
+
+
+def test_a_broken_photograph_does_not_keep_its_neighbours_from_being_labelled(cli, model, picture, tmp_path):
+    """They may be labelled beside themselves."""
+    for name in "abc":
+        picture.save(tmp_path / f"{name}.jpg")
+    broken = tmp_path / "b.jpg"
+    broken.write_bytes(broken.read_bytes()[:300])
+    before = contents(tmp_path)
+    outcome = cli("segment", tmp_path, "--model", model, "--out", tmp_path)
+    assert outcome.status == 1 and "1 of 3 images" in outcome.error and str(broken) in outcome.error
+    new = {"a.png", "a_overlay.png", "c.png", "c_overlay.png"}
+    assert contents(tmp_path).items() > before.items() and contents(tmp_path).keys() - before.keys() == new
+
+
+def test_an_interrupt_leaves_whole_files(cli, model, picture, tmp_path, monkeypatch):
+    for name in "ab":
+        picture.save(tmp_path / f"{name}.jpg")
+    logits, calls = segmentation.Segmenter.logits, []
+
+    def interrupted(self, image):
+        calls.append(image)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return logits(self, image)
+
+    words = ("segment", tmp_path / "a.jpg", tmp_path / "b.jpg", "--model", model, "--out", tmp_path / "out")
+    monkeypatch.setattr(segmentation.Segmenter, "logits", interrupted)
+    outcome = cli(*words)
+    assert outcome.status == 130 and outcome.error == "interrupted"
+    assert sorted(contents(tmp_path / "out")) == ["a.png", "a_overlay.png"]
+    assert labels_of(tmp_path / "out" / "a.png").shape == SIZE
     assert cli(*words).status == 0
-    assert labels_of(tmp_path / "out" / "a.png").shape == (40, 56)
+    assert len(contents(tmp_path / "out")) == 4
 
 
-def test_faults_are_one_line_and_nothing_is_written(cli, model, images, tmp_path):
-    masks, out = tmp_path / "masks", tmp_path / "out"
+def test_too_little_memory_is_reported(model):
+    segmenter = segmentation.Segmenter(load_network(model))
+
+    def exhausted(*_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8796093022208 bytes.")
+
+    segmenter._run = exhausted  # type: ignore[assignment]
+    with pytest.raises(JaxmapError, match="56x40 px takes more memory than there is.*--size"):
+        segmenter.logits(seeded_image(*SIZE))
+
+
+def test_an_input_is_never_replaced(images, model, tmp_path):
+    masks = tmp_path / "masks"
     masks.mkdir()
-    words = ("segment", images, "--model", model, "--out", out)
-    assert "2 of 2 masks are missing: a.png, b.png" in cli(*words, "--masks", masks).error
-    Image.fromarray(np.zeros((40, 56), np.uint8)).save(masks / "a.png")
-    Image.fromarray(np.zeros((40, 55), np.uint8)).save(masks / "b.png")
-    assert "the mask is 55x40 px" in cli(*words, "--masks", masks).error
-    Image.fromarray(np.full((40, 56), 3, np.uint8)).save(masks / "b.png")
-    assert "label 3, but there are 3 classes" in cli(*words, "--masks", masks).error
-    assert "no such file" in cli("segment", tmp_path / "no.png", "--model", model, "--out", out).error
-    assert "same name" in cli("segment", images, images / "a.png", "--model", model, "--out", out).error
-    assert "no such model file" in cli("segment", images, "--model", tmp_path / "no.safetensors", "--out", out).error
-    outcome = cli(*words, "--scores", tmp_path / "scores.json")
+    (masks / "a.png").write_bytes(b"mask")
+    (tmp_path / "link").symlink_to(images, target_is_directory=True)
+    found = segmentation.find_images([images])
+    inputs = [*found, masks / "a.png", model]
+
+    def refused(out: Path, scores: Path | None, name: str) -> None:
+        with pytest.raises(JaxmapError, match=f"{name} would be replaced"):
+            segmentation.check_outputs(found, out, inputs=inputs, scores=scores)
+
+    for out in (images, tmp_path / "link", images / ".." / "images", masks):
+        refused(out, None, "a.png")
+    for target in (masks / "a.png", model, images / "a.png"):
+        refused(tmp_path / "out", target, target.name)
+    segmentation.check_outputs(found, tmp_path / "out", inputs=inputs, scores=tmp_path / "scores.json")
+
+
+def test_two_outputs_never_share_a_name(images, picture, tmp_path):
+    picture.save(images / "a_overlay.png")
+    with pytest.raises(JaxmapError, match=r"a_overlay.png would be both"):
+        segmentation.check_outputs(segmentation.find_images([images]), tmp_path / "out", inputs=[], scores=None)
+    picture.save(images / "a.jpg")
+    with pytest.raises(JaxmapError, match="same name"):
+        segmentation.find_images([images])
+    with pytest.raises(JaxmapError, match="no such file"):
+        segmentation.find_images([tmp_path / "no.png"])
+
+
+def test_faults_of_masks_are_found_before_the_work(cli, model, images, tmp_path):
+    masks, found = tmp_path / "masks", segmentation.find_images([images])
+    masks.mkdir()
+    with pytest.raises(JaxmapError, match=r"2 of 2 masks are missing: a.png, b.png"):
+        segmentation.find_masks(found, masks)
+    Image.fromarray(np.zeros(SIZE, np.uint8)).save(masks / "a.png")
+    for fault, content in {
+        "the mask is 55x40 px": np.zeros((40, 55), np.uint8),
+        "label 3, but there are 3 classes": np.full(SIZE, 3, np.uint8),
+    }.items():
+        Image.fromarray(content).save(masks / "b.png")
+        with pytest.raises(JaxmapError, match=fault):
+            segmentation.check_masks(found, segmentation.find_masks(found, masks), 3)
+    outcome = cli("segment", images, "--model", model, "--out", tmp_path / "out", "--scores", tmp_path / "scores.json")
     assert outcome.status == 2 and "--masks" in outcome.error
-    assert not out.exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_scores_by_hand():
@@ -117,70 +248,3 @@ def test_scores_by_hand():
     assert SegmentationScores.empty(("a",)).summary()["accuracy"] is None
     with pytest.raises(JaxmapError, match="label 7"):
         scores.add(np.full((1, 4), 7, np.uint8), logits)
-
-
-@pytest.fixture
-def server(tmp_path):
-    """A folder that is served, and its URL."""
-    folder = tmp_path / "served"
-    folder.mkdir()
-
-    class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, *words):
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        yield folder, f"http://127.0.0.1:{running.server_port}"
-        running.shutdown()
-
-
-def test_weights_are_fetched_checked_and_kept(cli, server, tmp_path, monkeypatch):
-    pytest.importorskip("pooch")
-    monkeypatch.setenv("JAXMAP_CACHE", str(tmp_path / "cache"))
-    folder, url = server
-    architecture = torch_architecture("resnet18", ("background", "sand", "rock"))
-    source = folder / "resnet18.safetensors"
-    save_file(exported(architecture, list(tables.torchvision_backbone("resnet18")), tables.TORCH), source)
-    digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    public = {
-        name: weight_files.PublicWeights(f"https://no.invalid/{file}", checksum, "")
-        for name, file, checksum in (
-            ("good", source.name, digest[:8]),
-            ("whole", source.name, digest),
-            ("wrong", source.name, "0" * 8),
-            ("gone", "nothing.pth", digest),
-        )
-    }
-    monkeypatch.setattr(weight_files, "PUBLIC", public)
-    words = ("--out", tmp_path / "m.safetensors", "--mirror", url)
-    outcome = cli("weights", "fetch", "good", *words)
-    assert outcome.status == 0 and "downloading" in outcome.err
-    assert load_model(tmp_path / "m.safetensors").holds == "backbone"
-    source.write_bytes(b"changed")
-    assert "downloading" not in cli("weights", "fetch", "whole", *words).err, "the cache is used"
-    assert "should start with 00000000" in cli("weights", "fetch", "wrong", *words).error
-    assert not (tmp_path / "cache" / "weights" / source.name).exists()
-    assert "download failed" in cli("weights", "fetch", "whole", *words).error
-    assert "download failed" in cli("weights", "fetch", "gone", *words).error
-    assert "known are good" in cli("weights", "fetch", "other", *words).error
-
-
-def test_the_table_of_public_weights_is_well_formed():
-    for public in weight_files.PUBLIC.values():
-        assert public.url.startswith("https://") and re.fullmatch("[0-9a-f]{64}", public.sha256)
-        assert public.url.endswith(f"-{public.sha256[:8]}.pth")
-
-
-@pytest.mark.realdata
-def test_weights_import_and_segment_label_the_cat(cli, realdata, tmp_path):
-    import skimage
-
-    source = realdata / "weights" / "deeplabv3_mnv2_voc_trainval_folded.safetensors"
-    if not source.exists():
-        pytest.skip(f"no {source}")
-    assert cli("weights", "import", source, "--out", tmp_path / "voc.safetensors").status == 0
-    Image.fromarray(skimage.data.chelsea()).save(tmp_path / "chelsea.png")
-    words = ("segment", tmp_path / "chelsea.png", "--model", tmp_path / "voc.safetensors", "--out", tmp_path / "out")
-    assert cli(*words).status == 0
-    assert 0.75 <= (labels_of(tmp_path / "out" / "chelsea.png") == 8).mean() <= 0.83

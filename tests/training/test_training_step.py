@@ -246,7 +246,7 @@ def test_two_devices_come_to_the_weights_of_one(tmp_path):
 def test_mobilenet_learns_too():
     """The real backbone, in the least network around it, without the stand-in."""
     from jaxmap.models import deeplab
-    from jaxmap.models.mobilenet_v2 import MobileNetV2
+    from jaxmap.models.backbones import MobileNetV2
 
     backbones: dict = deeplab._BACKBONES
     stand_in, backbones["mobilenet_v2"] = backbones["mobilenet_v2"], MobileNetV2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import zipfile
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -81,8 +80,7 @@ class Bomb:
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_a_bomb_is_refused_by_name_and_does_not_go_off(tmp_path, protocol):
     program = pickle.dumps({"state_dict": {"w": Bomb(tmp_path / "gone_off")}}, protocol=protocol)
-    told = refusal(write_zip(tmp_path / "bomb.pth", program))
-    assert "refused" in told
+    assert "refused" in refusal(write_zip(tmp_path / "bomb.pth", program))
     assert not (tmp_path / "gone_off").exists()
 
 
@@ -133,14 +131,3 @@ def test_a_truncated_file_is_an_error(tmp_path):
     for length in (0, 10, len(whole) // 2, len(whole) - 1):
         (tmp_path / "cut.pth").write_bytes(whole[:length])
         refusal(tmp_path / "cut.pth")
-
-
-def test_any_damage_is_an_error_or_harmless(tmp_path):
-    whole, draw = bytearray((GOLDEN / "tiny.pth").read_bytes()), np.random.default_rng(0)
-    for _ in range(150):
-        damaged = bytearray(whole)
-        for place in draw.integers(0, len(whole), 4):
-            damaged[place] = draw.integers(256)
-        (tmp_path / "damaged.pth").write_bytes(damaged)
-        with suppress(JaxmapError):
-            read_torch_zip(tmp_path / "damaged.pth")

@@ -21,6 +21,7 @@ def network(realdata):
     return pure_network(imported.architecture, imported.weights)
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("picture", "name", "least", "most"),

@@ -1,4 +1,4 @@
-"""Model files come back as they went, and whatever is wrong with one is told in a line."""
+"""Saved models load unchanged, and every fault of a model file is one line."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def path(tmp_path, weights):
 def refusal(path) -> str:
     with pytest.raises(JaxmapError) as caught:
         load_model(path)
-    told = str(caught.value)
-    assert str(path) in told and ";" in told and len(told) < 800
-    return told
+    line = str(caught.value)
+    assert str(path) in line and ";" in line and len(line) < 800
+    return line
 
 
 def header_of(path) -> tuple[dict, bytes]:
@@ -88,7 +88,7 @@ def test_a_backbone_alone_is_no_network(tmp_path, weights):
         load_network(tmp_path / "b.safetensors")
 
 
-def test_all_differences_are_told_together(tmp_path, weights):
+def test_all_differences_are_reported_together(tmp_path, weights):
     changed = dict(weights)
     del changed["backbone.stem.kernel"]
     changed["extra"] = np.zeros(3, np.float32)

@@ -1,0 +1,269 @@
+"""Laws of whole networks: sizes, folding, determinism, one compilation, gradients by finite differences."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from golden.seeded_weights import seeded_image, seeded_weights
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxmap.errors import JaxmapError
+from jaxmap.models.architecture import (
+    BACKBONES,
+    Architecture,
+    folded,
+    tf_architecture,
+    torch_architecture,
+    torchvision_architecture,
+)
+from jaxmap.models.backbones import InvertedResidual, ResidualUnit, XceptionUnit
+from jaxmap.models.deeplab import (
+    DeepLab,
+    fold_batch_norm,
+    inference_network,
+    make_network,
+    network_weights,
+    padded_size,
+    pure_network,
+    weight_shapes,
+)
+from jaxmap.models.heads import Aspp, Decoder
+
+CLASSES = ("background", "sand", "rock")
+SMALL = replace(torch_architecture("mobilenet_v2", CLASSES), top_conv=False, head_channels=8, low_level_channels=4)
+slow = pytest.mark.slow
+
+
+def test_a_small_network_keeps_the_laws():
+    """Size, padding, batch, folding, the same bits twice, one compilation."""
+    # Of all backbones it compiles fastest.
+    record = replace(SMALL, backbone="resnet18", atrous_rates=(2,))
+    weights, image, traced = seeded_weights(record), seeded_image(45, 61)[None], []
+    apply = pure_network(record, weights).apply
+    compiled = jax.jit(lambda weights, images: (traced.append(images.shape), apply(weights, images))[1])
+    logits = np.asarray(compiled(weights, image))
+    assert logits.shape == (1, 45, 61, 3) and logits.std() > 0.01
+    assert np.asarray(compiled(weights, image)).tobytes() == logits.tobytes()
+    assert traced == [image.shape]
+    # Padding is nothing but more pixels of the mean, and the other images of a batch do not matter.
+    padded = np.broadcast_to(np.asarray(record.mean, np.float32) * 255, (2, 48, 64, 3)).copy()
+    padded[:, :45, :61] = np.concatenate([image, image[:, ::-1]])
+    np.testing.assert_allclose(compiled(weights, padded)[:1, :45, :61], logits, atol=1e-4)
+    # Neither folding nor transformed kernels change anything.
+    folded_record, fewer = fold_batch_norm(record, weights)
+    assert set(fewer) == set(weight_shapes(folded_record)) and not any(".norm." in name for name in fewer)
+    fast = inference_network(record, weights)
+    assert sum(kernel.shape[:2] == (4, 4) for kernel in fast.weights.values()) == 10
+    np.testing.assert_allclose(jax.jit(fast.apply)(fast.weights, image), logits, atol=1e-4)
+
+
+def test_the_network_of_a_key_is_always_the_same():
+    shapes = weight_shapes(SMALL)
+    one, same, other = (
+        {name: np.asarray(value) for name, value in network_weights(make_network(SMALL, jax.random.key(seed))).items()}
+        for seed in (1, 1, 2)
+    )
+    assert {name: value.shape for name, value in one.items()} == shapes
+    assert all(np.array_equal(one[name], same[name]) for name in shapes)
+    assert not np.array_equal(one["backbone.stem.kernel"], other["backbone.stem.kernel"])
+
+
+QUICK_STRIDES = [(torch_architecture, 8, "mobilenet_v2"), (torch_architecture, 8, "resnet50")]
+QUICK_STRIDES += [(tf_architecture, 16, "mobilenet_v2"), (tf_architecture, 16, "xception65")]
+ALL_STRIDES = [(*family, name) for family in ((torch_architecture, 8), (tf_architecture, 16)) for name in BACKBONES]
+
+
+@pytest.mark.parametrize(
+    ("family", "stride", "backbone"),
+    [pytest.param(*case, marks=() if case in QUICK_STRIDES else slow) for case in ALL_STRIDES],
+)
+def test_every_backbone_has_the_right_strides(backbone, stride, family):
+    architecture = family(backbone, CLASSES, output_stride=stride)
+    network = nnx.eval_shape(lambda: DeepLab(architecture))
+    sizes = [padded_size(size, architecture) for size in (50, 65)]
+    images = jax.ShapeDtypeStruct((1, *sizes, 3), jnp.float32)
+    features, low_level = nnx.eval_shape(lambda model, x: model.backbone(x), network, images)
+    assert features.shape == (1, *(-(-size // stride) for size in sizes), network.backbone.channels)
+    assert low_level.shape == (1, *(-(-size // 4) for size in sizes), network.backbone.low_level_channels)
+
+
+def test_tensorflow_sizes_are_a_multiple_and_one():
+    record = tf_architecture("mobilenet_v2", CLASSES)
+    assert [padded_size(size, record) for size in (1, 17, 18, 512, 513)] == [17, 17, 33, 513, 513]
+    record = torch_architecture("mobilenet_v2", CLASSES)
+    assert [padded_size(size, record) for size in (1, 16, 17, 512)] == [16, 16, 32, 512]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: InvertedResidual(4, 4, 2, 1, 2, SMALL),
+        lambda: ResidualUnit(4, 2, 2, (1, 2), replace(SMALL, padding="same"), bottleneck=True),
+        pytest.param(lambda: XceptionUnit(4, (4, 4, 6), 2, 1, SMALL, shortcut="conv"), marks=slow),
+        lambda: Aspp(4, replace(SMALL, atrous_rates=(2,), head_channels=4)),
+    ],
+    ids=["inverted residual", "bottleneck", "xception", "aspp"],
+)
+def test_gradients_equal_finite_differences(make):
+    images = np.random.default_rng(0).normal(size=(1, 9, 8, 4))
+    check_gradient(make, lambda model: model(jnp.asarray(images)))
+
+
+@pytest.mark.parametrize("record", [pytest.param(SMALL, marks=slow), folded(SMALL)], ids=["batch norm", "folded"])
+def test_gradients_of_the_decoder_equal_finite_differences(record):
+    draw = np.random.default_rng(0)
+    coarse, fine = draw.normal(size=(1, 2, 3, 8)), draw.normal(size=(1, 7, 9, 4))
+    check_gradient(lambda: Decoder(4, record), lambda model: model(jnp.asarray(coarse), jnp.asarray(fine), jnp.tanh))
+
+
+def check_gradient(make, call):
+    with jax.enable_x64(True):
+        graph, state = nnx.split(make())
+        draw = np.random.default_rng(0)
+        state = jax.tree.map(lambda value: value.astype(jnp.float64) + 0.3 * abs(draw.normal(size=value.shape)), state)
+
+        @jax.jit
+        @jax.value_and_grad
+        def loss(state):
+            result = call(nnx.merge(graph, state))
+            result = result[0] if isinstance(result, tuple) else result
+            return (result * jnp.cos(jnp.arange(result.size)).reshape(result.shape)).sum()
+
+        leaves, tree = jax.tree.flatten(state)
+        step = jax.tree.unflatten(tree, [draw.normal(size=leaf.shape) for leaf in leaves])
+        gradient = jax.tree.leaves(loss(state)[1])
+        backward = sum(float((one * other).sum()) for one, other in zip(gradient, jax.tree.leaves(step), strict=True))
+        ahead, behind = (loss(jax.tree.map(lambda a, b, s=s: a + s * b, state, step))[0] for s in (1e-7, -1e-7))
+    assert abs(backward) > 1e-3
+    np.testing.assert_allclose((ahead - behind) / 2e-7, backward, rtol=1e-5)
+
+
+def test_faults_of_an_architecture_are_reported_together():
+    with pytest.raises(JaxmapError) as caught:
+        replace(SMALL, backbone="vgg", output_stride=4, classes=("a", "a"), std=(1.0, 0.0, 1.0))
+    for word in ("vgg", "output_stride is 4", "different printable names", "std.1 is 0.0"):
+        assert word in str(caught.value)
+
+
+FAMILIES = {"torch": torch_architecture, "tf": tf_architecture, "torchvision": torchvision_architecture}
+NARROW = {"head_channels": 4, "low_level_channels": 3}
+STEPS = (1e-6, 1e-7)
+"""The larger rounds off less, the smaller crosses fewer corners of a ReLU."""
+
+
+def narrow(family: str, backbone: str) -> Architecture:
+    """A network of this family with a head of a few channels; atrous branches see neighbours on 4x4 features."""
+    architecture = replace(FAMILIES[family](backbone, CLASSES, output_stride=8), **NARROW)
+    return replace(architecture, atrous_rates=(2,))
+
+
+def kinds(architecture: Architecture) -> dict[str, list[str]]:
+    """Weights by their place in the design: `backbone.units.N.expand.norm.scale`."""
+    found: dict[str, list[str]] = {}
+    for name in weight_shapes(architecture):
+        found.setdefault(re.sub(r"\.\d+", ".N", name), []).append(name)
+    return found
+
+
+def lively_weights(architecture: Architecture) -> dict[str, np.ndarray]:
+    """Seeded weights under which the slopes of the first layers are no mere rounding.
+
+    MobileNetV2's projections are linear: without norms that keep the scale its chain fades. The sums of the
+    others keep it by themselves.
+    """
+    factor = np.float32(1.6 if architecture.backbone == "mobilenet_v2" else 1)
+    weights = seeded_weights(architecture)
+    return {name: value * factor if name.endswith(".norm.scale") else value for name, value in weights.items()}
+
+
+@slow
+@pytest.mark.parametrize(
+    ("family", "backbone"),
+    [
+        ("torch", "mobilenet_v2"),
+        ("tf", "mobilenet_v2"),
+        ("torchvision", "resnet18"),
+        ("torch", "resnet50"),
+        ("tf", "xception65"),
+    ],
+)
+def test_the_gradient_of_a_loss_is_its_finite_difference_for_every_kind_of_weight(family, backbone):
+    architecture, draw = narrow(family, backbone), np.random.default_rng(0)
+    with jax.enable_x64(True):
+        weights = {name: jnp.asarray(value, jnp.float64) for name, value in lively_weights(architecture).items()}
+        network = pure_network(architecture, weights)
+        image = jnp.asarray(seeded_image(30, 33)[None], jnp.float64)
+        truth = jnp.asarray(draw.integers(0, len(CLASSES), (1, 30, 33)))
+
+        @jax.jit
+        @jax.value_and_grad
+        def loss(weights):
+            chances = jax.nn.log_softmax(network.apply(weights, image))
+            return -jnp.take_along_axis(chances, truth[..., None], axis=-1).mean()
+
+        value, gradient = loss(weights)
+        assert value.dtype == jnp.float64
+        for kind, names in kinds(architecture).items():
+            name = names[draw.integers(len(names))]
+            slopes = np.asarray(gradient[name])
+            # The steepest of its array: at the others little is left but rounding.
+            place = np.unravel_index(np.abs(slopes).argmax(), slopes.shape)
+            moved = [
+                [loss({**weights, name: weights[name].at[place].add(sign * step)})[0] for sign in (1, -1)]
+                for step in STEPS
+            ]
+            found = [float(one - other) / (2 * step) for (one, other), step in zip(moved, STEPS, strict=True)]
+            nearest = min(found, key=lambda slope: abs(slope - slopes[place]))
+            np.testing.assert_allclose(nearest, slopes[place], rtol=1e-4, err_msg=kind)
+            assert abs(slopes[place]) > 1e-6, f"{kind} does nothing"
+
+
+@cache
+def both_forms(family: str, backbone: str):
+    """A network and its folded form, compiled; both take weights."""
+    architecture = FAMILIES[family](backbone, CLASSES)
+    without_norms = replace(architecture, backbone_norm=False, head_norm=False)
+    return architecture, *(jax.jit(pure_network(record, {}).apply) for record in (architecture, without_norms))
+
+
+def random_weights(architecture: Architecture, seed: int) -> dict[str, jax.Array]:
+    """Kernels that keep the scale, and batch-norm statistics such as training leaves behind."""
+    draw = np.random.default_rng(seed)
+
+    def array(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        if name.endswith(".kernel"):
+            fan = shape[0] * shape[1] * shape[2]
+            return draw.standard_normal(shape, np.float32) * np.float32((1 / fan) ** 0.5)
+        if name.endswith(".norm.var"):
+            return np.exp(draw.normal(0, 0.3, shape))
+        if name.endswith(".norm.scale"):
+            return draw.uniform(0.3, 0.9, shape)
+        return draw.normal(0, 0.1, shape)
+
+    return {name: jnp.asarray(array(name, s), jnp.float32) for name, s in weight_shapes(architecture).items()}
+
+
+@slow
+@settings(max_examples=3)
+@given(seed=st.integers(0, 2**32 - 1))
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_folding_changes_nothing_and_evaluation_repeats_its_bits(family, backbone, seed):
+    architecture, plain, folded = both_forms(family, backbone)
+    weights, image = random_weights(architecture, seed), seeded_image(33, 47)[None]
+    logits = plain(weights, image)
+    record, fewer = fold_batch_norm(architecture, weights)
+    assert (record.backbone_norm, record.head_norm) == (False, False)
+    assert set(fewer) == set(weight_shapes(record))
+    np.testing.assert_allclose(folded(fewer, image), logits, atol=1e-4, rtol=0)
+    assert float(jnp.std(logits)) > 1e-3
+    for run, given_weights in ((plain, weights), (folded, fewer)):
+        assert np.asarray(run(given_weights, image)).tobytes() == np.asarray(run(given_weights, image)).tobytes()
