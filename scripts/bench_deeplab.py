@@ -60,8 +60,8 @@ def our_training(state: dict, images, labels) -> Runner:
     from jaxmap.models.deeplab import training_form
     from jaxmap.models.importers import import_weights
     from jaxmap.training.losses import total_loss
-    from jaxmap.training.optimiser import is_statistic
-    from jaxmap.training.options import LossOptions
+    from jaxmap.training.options import PixelLossOptions
+    from jaxmap.training.step import is_statistic
 
     with tempfile.TemporaryDirectory() as folder:
         save_file(state, Path(folder) / "smp.safetensors")
@@ -72,7 +72,7 @@ def our_training(state: dict, images, labels) -> Runner:
 
     def loss(moved, fixed, images, labels):
         logits, statistics = network({**moved, **fixed}, images, jax.random.key(0))
-        return total_loss(logits, labels, jnp.ones(logits.shape[-1]), LossOptions()), statistics
+        return total_loss(logits, labels, jnp.ones(logits.shape[-1]), PixelLossOptions()), statistics
 
     def step(moved, fixed, memory, images, labels):
         (value, statistics), gradient = jax.value_and_grad(loss, has_aux=True)(moved, fixed, images, labels)

@@ -2,15 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, dataclass_transform
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from jaxmap.errors import UsageError
 from jaxmap.host.files import config_folder
 
 Config = TypeVar("Config")
+
+
+@dataclass_transform(frozen_default=True)
+def options(section: str = "") -> Callable[[type[Config]], type[Config]]:
+    """Makes a class a frozen dataclass whose values are validated whenever it is made.
+
+    Making it raises a UsageError that names every unknown key and every value out of bounds.
+
+    Args:
+        section: its key in the configuration, which errors name.
+    """
+
+    def decorate(kind: type[Config]) -> type[Config]:
+        made: Any = dataclass(kind, frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
+        validate = made.__init__
+
+        @wraps(validate)
+        def init(self: Config, *values: Any, **named: Any) -> None:
+            try:
+                validate(self, *values, **named)
+            except ValidationError as error:
+                complaints = "; ".join(_complaints(error, section))
+                raise UsageError(complaints, fix="choose a valid value") from error
+
+        made.__init__ = init
+        return made
+
+    return decorate
 
 
 class Settings(Generic[Config]):
@@ -69,12 +100,13 @@ class Settings(Generic[Config]):
         return self._adapter.dump_python(config, mode="json")
 
 
-def _complaints(error: ValidationError) -> list[str]:
+def _complaints(error: ValidationError, section: str = "") -> list[str]:
     """One clause for each fault, by its dotted key."""
     clauses: dict[str, str] = {}
     for fault in error.errors():
         # Branches of a union appear in the location; they are not part of the key.
-        key = ".".join(str(part) for part in fault["loc"] if isinstance(part, int) or part.isidentifier())
+        parts = [str(part) for part in fault["loc"] if isinstance(part, int) or part.isidentifier()]
+        key = ".".join([section, *parts] if section else parts)
         if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
             clauses[key] = f"unknown key {key}"
         else:

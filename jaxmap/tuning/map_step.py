@@ -27,7 +27,8 @@ from jaxmap.models.architecture import Architecture
 from jaxmap.models.convolutions import resize_bilinear
 from jaxmap.models.deeplab import Weights, training_form
 from jaxmap.training.options import TrainingOptions
-from jaxmap.training.step import StepInfo, TrainState, make_updater, parted
+from jaxmap.training.step import StepMetrics as StepInfo
+from jaxmap.training.step import TrainState, make_updater, parted
 from jaxmap.tuning.frame_crops import FrameBatch, crop_frame, points_per_pixel, widest_camera
 from jaxmap.tuning.map_loss import LossOptions, MapTruth, cells_loss, soft_cells
 from jaxmap.tuning.pull_back import frame_evidence

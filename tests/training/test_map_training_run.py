@@ -125,14 +125,14 @@ def test_an_interrupted_run_goes_on_exactly(cli, finished, place, tmp_path, monk
 
 SLOWLY = """\
 import sys, time
-from jaxmap.runs.training import Meter
+from jaxmap.runs.training import EpochMeter
 from tiny_training import main, tiny_network
 
-add = Meter.add
+add = EpochMeter.add
 def slowly(*words):
     time.sleep(0.5)
     return add(*words)
-Meter.add = slowly
+EpochMeter.add = slowly
 with tiny_network():
     sys.exit(main(sys.argv[1:]))
 """
@@ -152,9 +152,9 @@ def test_a_killed_process_is_gone_on_with(cli, finished, place, tmp_path):
 
 def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(place):
     from jaxmap.runs.map_training import plan_map_training
-    from jaxmap.runs.training_plan import load_train_config
+    from jaxmap.runs.training_plan import TRAIN_SETTINGS
 
-    config = replace(load_train_config(str(place / "map.yaml")), ground_truth=place / "truth.tif")
+    config = replace(TRAIN_SETTINGS.load(str(place / "map.yaml")), ground_truth=place / "truth.tif")
     plan = plan_map_training(str(place / "sequence"), config, place / "first.safetensors", notify=lambda line: None)
     for index, kept in enumerate(plan.data.train):
         seen = scenes.scene_frame(index)
@@ -172,9 +172,9 @@ FAULTS = {
     "a loss of pixels": (2, ("--loss.lovasz", "1"), "are of pixels"),
     "no loss": (2, ("--loss.cross-entropy", "0", "--loss.soft-iou", "0"), "weight of 0"),
     "fixed copies": (2, ("--augmentation.copies", "3"), "is for images"),
-    "an ensemble": (2, ("--mapping.ensemble.members", "2"), "mapping.ensemble.members says nothing"),
-    "another labeller": (2, ("--mapping.labeller", "plane"), "mapping.labeller says nothing"),
-    "labels of others": (2, ("--mapping.labels", "there"), "mapping.labels says nothing"),
+    "an ensemble": (2, ("--mapping.ensemble.members", "2"), "mapping.ensemble.members has no effect"),
+    "another labeller": (2, ("--mapping.labeller", "plane"), "mapping.labeller has no effect"),
+    "labels of others": (2, ("--mapping.labels", "there"), "mapping.labels has no effect"),
     "classes that the network has not": (2, ("--classes", "background", "mud", "rock"), "would be random"),
     "a truth of one known class": (2, ("--map-truth.remap", "1=mud", "2=rock"), "fewer than two classes"),
     "codes without a meaning": (1, ("--map-truth.remap", "1=sand", "3=rock"), "mean nothing"),

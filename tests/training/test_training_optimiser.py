@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.training.optimiser import is_statistic, make_optimiser, poly_rate, trained_names
 from jaxmap.training.options import OptimiserOptions
+from jaxmap.training.step import is_statistic, make_optimiser, poly_rate, trained_names
 
 PLAIN = OptimiserOptions(learning_rate=0.1, warmup_steps=0, weight_decay=0.0, clip_norm=None)
 KINDS = ("adamw", "sgd")

@@ -33,9 +33,9 @@ from training_data import CLASSES, change_mask, scene, write_pair
 from jaxmap.errors import JaxmapError
 from jaxmap.models.checkpoint import load_network
 from jaxmap.runs.training import TrainingFolder, TrainingRun
-from jaxmap.runs.training_plan import TrainingPlan, load_train_config, plan_training
+from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainingPlan, plan_image_training
 from jaxmap.training.checkpoints import Checkpoints
-from jaxmap.training.step import StepInfo, TrainState
+from jaxmap.training.step import StepMetrics, TrainState
 
 OUTPUTS = {"model.safetensors", "history.csv", "metrics.json", "config.yaml", "report.html", "checkpoints"}
 TIMES = ("seconds", "images_per_s")
@@ -71,7 +71,7 @@ def same_run(run: Path, whole: Path) -> None:
 
 
 def planned(data: Path) -> TrainingPlan:
-    return plan_training(data, load_train_config(str(data / "tiny.yaml")), None, notify=lambda line: None)
+    return plan_image_training(data, TRAIN_SETTINGS.load(str(data / "tiny.yaml")), None, notify=lambda line: None)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_a_run_writes_what_it_says(whole_run):
     assert metrics["examples_seen"] == 2 * STEPS and metrics["images"] == {"train": 5, "validation": 2}
     assert metrics["class_pixels"]["rock"]["train"] > 0
     assert metrics["kept_epoch"] == metrics["best"]["epoch"]
-    assert load_train_config(str(whole_run / "config.yaml")).batch_size == 2
+    assert TRAIN_SETTINGS.load(str(whole_run / "config.yaml")).batch_size == 2
 
 
 def test_the_history_is_complete(whole_run):
@@ -146,7 +146,7 @@ def test_the_history_is_complete(whole_run):
 def test_the_page_tells_the_run(whole_run):
     page = (whole_run / "report.html").read_text()
     assert page.lower().startswith("<!doctype html>")
-    assert "tiny_data" in page and "random weights" in page and "data:image" in page
+    assert "tiny_data" in page and "Initial weights" in page and "data:image" in page
     assert "Stopped" not in page and "Interrupted" not in page
 
 
@@ -178,7 +178,7 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(step, cli, plan, tiny_data, wh
     assert saved_steps(run) == {1: [], 4: [3], STEPS: [3, 5]}[step]
     if step == 4:
         outcome = cli(*train_words(tiny_data, run, "--resume"))
-        assert outcome.status == 0 and f"going on after epoch 1 of {EPOCHS}" in outcome.err, outcome.err
+        assert outcome.status == 0 and f"resuming after epoch 1 of {EPOCHS}" in outcome.err, outcome.err
     else:
         go(plan, run, resume=True)
     same_run(run, whole_run)
@@ -194,14 +194,14 @@ def test_a_run_may_be_cut_again_and_again(plan, whole_run, tmp_path):
 
 SLOWLY = """
 import sys, time
-from jaxmap.runs.training import Meter
+from jaxmap.runs.training import EpochMeter
 from tiny_training import main, tiny_network
 
-add = Meter.add
+add = EpochMeter.add
 def slowly(*words):
     time.sleep(0.3)
     return add(*words)
-Meter.add = slowly
+EpochMeter.add = slowly
 with tiny_network():
     sys.exit(main(sys.argv[1:]))
 """
@@ -222,7 +222,7 @@ def test_a_killed_process_is_gone_on_with(plan, tiny_data, whole_run, tmp_path):
 def test_an_interrupt_is_one_line_and_says_how_to_go_on(number, cli, plan, tiny_data, whole_run, tmp_path, monkeypatch):
     check = TrainingRun._check_finite
 
-    def interrupted(self: TrainingRun, info: StepInfo, step: int, epoch: int) -> None:
+    def interrupted(self: TrainingRun, info: StepMetrics, step: int, epoch: int) -> None:
         check(self, info, step, epoch)
         if step == 4:
             os.kill(os.getpid(), number)
@@ -383,7 +383,7 @@ def test_fewer_examples_than_a_batch_holds(cli, data_copy, tmp_path):
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_its_images(plan, whole_run, tmp_path):
     trained = plan.trainer.step
 
-    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepInfo]:
+    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepMetrics]:
         if int(state.step) != 6:
             return trained(state, batch, key)
         weights = {**state.weights, "classifier.bias": state.weights["classifier.bias"] * np.nan}
@@ -419,7 +419,7 @@ def test_an_answer_that_is_not_finite_in_validation_is_told(plan, tmp_path):
     """Weights may be finite and still run over on an image that was not trained on."""
     trained = plan.trainer.step
 
-    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepInfo]:
+    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepMetrics]:
         after, info = trained(state, batch, key)
         if int(after.step) != plan.order.epoch_end(min(plan.config.validate_every, plan.config.epochs) - 1):
             return after, info
@@ -443,7 +443,7 @@ def halve(folder: Path) -> None:
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(cli, tiny_data, whole_run, run_copy):
     halve(run_copy / "checkpoints" / str(STEPS))
     outcome = cli(*train_words(tiny_data, run_copy, "--resume"))
-    assert outcome.status == 0 and f"going on after epoch 2 of {EPOCHS}" in outcome.err, outcome.err
+    assert outcome.status == 0 and f"resuming after epoch 2 of {EPOCHS}" in outcome.err, outcome.err
     same_run(run_copy, whole_run)
     # The damaged one has been replaced.
     assert "nothing is left to do" in cli(*train_words(tiny_data, run_copy, "--resume")).err
@@ -452,7 +452,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(cli, tiny_data, whole_
 @pytest.mark.parametrize("fate", ["gone", "halved", "empty", "junk"])
 def test_no_damage_to_a_file_of_a_checkpoint_goes_unnoticed(fate, plan, whole_run, tmp_path):
     """The checkpoint before is read instead, or the very same values."""
-    like = plan.trainer.init(plan.start.weights)
+    like = plan.trainer.init(plan.network.weights)
     newest = whole_run / "checkpoints" / str(STEPS)
     whole = Checkpoints(whole_run / "checkpoints").restore(like)
     assert whole is not None and int(whole.state.step) == STEPS

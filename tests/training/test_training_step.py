@@ -19,8 +19,8 @@ from training_data import CLASSES, scene
 import jaxmap
 from jaxmap.models.deeplab import Weights, initial_weights, pure_network
 from jaxmap.training.augment import augment
-from jaxmap.training.options import AugmentationOptions, LossOptions, OptimiserOptions, TrainingOptions
-from jaxmap.training.step import Batch, StepInfo, Trainer, TrainState, make_trainer
+from jaxmap.training.options import AugmentationOptions, OptimiserOptions, PixelLossOptions, TrainingOptions
+from jaxmap.training.step import Batch, StepMetrics, Trainer, TrainState, make_trainer
 
 SIZE_PX = (32, 32)
 ALL_NORMS = ("backbone", "aspp", "decoder")
@@ -31,7 +31,7 @@ LEARNING = TrainingOptions(
 )
 FROZEN = replace(
     LEARNING,
-    loss=LossOptions(cross_entropy=0.5, soft_iou=1, lovasz=1),
+    loss=PixelLossOptions(cross_entropy=0.5, soft_iou=1, lovasz=1),
     optimiser=OptimiserOptions(kind="sgd", learning_rate=0.1, backbone_rate=0, warmup_steps=0, clip_norm=1.0),
 )
 DROPPING = replace(ARCHITECTURE, dropout=0.5)
@@ -47,12 +47,12 @@ class Compiled:
     def init(self, **changes: object) -> TrainState:
         return replace(self.trainer.init(self.weights), **changes)  # type: ignore[arg-type]
 
-    def step(self, state: TrainState, batch: Batch, key: int = 0) -> tuple[TrainState, StepInfo]:
+    def step(self, state: TrainState, batch: Batch, key: int = 0) -> tuple[TrainState, StepMetrics]:
         """One step, its arguments placed as in a run."""
         sharding = NamedSharding(Mesh(jax.local_devices(), ("data",)), PartitionSpec())
         return self.trainer.step(*jax.device_put((state, batch, jax.random.key(key)), sharding))
 
-    def run(self, steps: int, batch: Batch, key: int = 0) -> tuple[TrainState, list[StepInfo]]:
+    def run(self, steps: int, batch: Batch, key: int = 0) -> tuple[TrainState, list[StepMetrics]]:
         state, infos = self.init(), []
         for _ in range(steps):
             state, info = self.step(state, batch, key)
