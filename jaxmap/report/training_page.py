@@ -442,9 +442,9 @@ def calibration_chart(scores: Scores) -> str:
         Line("pixels", [(confidence, share) for confidence, _, share in points], BAR),
         Line("accuracy", [(confidence, accuracy) for confidence, accuracy, _ in points], ACCENT, strong=True),
     ]
-    title, ranges = "Accuracy over confidence", {"x_range": (0, 1), "y_range": (0, 1)}
     caption = f"Calibration: confidence is off by {score_text(scores.get('ece'))} on average"
-    chart = line_chart(title, ("confidence", "share"), lines, **ranges)
+    axes = ("confidence", "share")
+    chart = line_chart("Accuracy over confidence", axes, lines, x_range=(0, 1), y_range=(0, 1))
     return f"<figure><figcaption>{caption}</figcaption>{chart}</figure>"
 
 

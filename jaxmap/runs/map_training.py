@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -267,10 +267,9 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
             fix="train it on images first, and leave --classes, network and norm as they are there",
         )
     mapping = replace(config.mapping, model=path, classes=config.classes)
-    with _options_of("jaxmap map", "--mapping.OPTION"):
-        plan = plan_run(source, mapping, lambda line: notify(f"mapping: {line}"))
-    with _options_of("jaxmap evaluate", "--map-truth.remap and --map-truth.crs"):
-        truth, truths = read_cells(plan, config)
+    with _naming_options_of("map", "mapping") as named:
+        plan = plan_run(source, mapping, lambda line: notify(named(line)))
+    truth, truths = read_cells(plan, config)
     frames = prepare_training_frames(plan, truth, saved, config.map_truth.anchor, notify)
     train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
     data = MapTrainingData(plan, truth, train, validation, config.ground_truth.name)
@@ -308,8 +307,6 @@ def _check_settings(config: TrainConfig) -> None:
         raise UsageError(
             "loss.lovasz and loss.label_smoothing are of pixels", where="--supervision map", fix="leave them out"
         )
-    if not (losses.cross_entropy or losses.soft_iou):
-        raise UsageError("every loss has a weight of 0", where="loss", fix="give one of them a weight")
     if config.augmentation.copies is not None:
         raise UsageError("augmentation.copies is for images", where="--supervision map", fix="leave it out")
     if jax.local_device_count() > 1:
@@ -330,15 +327,16 @@ def _check_settings(config: TrainConfig) -> None:
 
 
 @contextmanager
-def _options_of(command: str, here: str) -> Iterator[None]:
-    """Adds, to errors that name options of another command, what those are called in `jaxmap train`."""
+def _naming_options_of(command: str, section: str) -> Iterator[Callable[[str], str]]:
+    """Says of errors that name options of another command, and of lines it is given, where those stand in train."""
+
+    def named(text: str, whole: str = "") -> str:
+        return f"jaxmap {command} (options below {section}): {text}" if "--" in text + whole else text
+
     try:
-        yield
+        yield named
     except JaxmapError as error:
-        if "--" not in error.fix:
-            raise
-        fix = f"{error.fix} (an option of {command}: here {here})"
-        raise type(error)(error.what, where=error.where, fix=fix) from error
+        raise type(error)(named(error.what, error.fix), where=error.where, fix=error.fix) from error
 
 
 def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, MapTruth]]:
@@ -350,7 +348,8 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
     """
     options, path = config.map_truth, config.ground_truth
     assert path is not None
-    coding = choose_coding(options.remap or (), None, "map_truth.remap")
+    with _naming_options_of("evaluate", "map_truth"):
+        coding = choose_coding(options.remap or (), None, "map_truth.remap")
     named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
     shown = [index for index, name in enumerate(config.classes) if name in named]
     if len(shown) < 2:
@@ -364,7 +363,8 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
         read_crs(options.crs, "map_truth.crs")
     place, rasters, truths, labels, cells = _place(plan), {}, {}, None, None
     for index in shown:
-        raster = read_label_orthomosaic(path, place, coding=coding, target=config.classes[index], crs=options.crs)
+        with _naming_options_of("evaluate", "map_truth"):
+            raster = read_label_orthomosaic(path, place, coding=coding, target=config.classes[index], crs=options.crs)
         rasters[index] = raster
         truths[index], found, cells = make_map_truth(
             plan.grid, raster, plan.sequence.site_origin, plan.sequence.crs, cell_size_m=options.cell_size_m

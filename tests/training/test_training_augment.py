@@ -14,7 +14,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from jaxmap.labels import IGNORE
-from jaxmap.training.augment import CropWindow, augment, change_light, cut, draw_pixel, draw_window, whole_window
+from jaxmap.training.augment import (
+    CropWindow,
+    augment,
+    change_light,
+    cut,
+    cut_nearest,
+    draw_pixel,
+    draw_window,
+    whole_window,
+)
 from jaxmap.training.options import AugmentationOptions
 
 STORED_PX = (20, 24)
@@ -225,22 +234,17 @@ def test_a_pixel_of_an_image_without_labels_is_its_first():
 
 
 def test_crops_around_classes_hold_what_is_rare():
-    labels = np.zeros((64, 80), np.uint8)
-    labels[50, 7] = 2
+    labels = jnp.zeros((64, 80), jnp.uint8).at[50, 7].set(2)
     size_px, enlarged = np.array(labels.shape), replace(OPTIONS, scale=(1.0, 2.0))
 
     def held(class_share: float) -> float:
-        draw = partial(draw_window, options=replace(enlarged, class_share=class_share))
-        views = jax.jit(jax.vmap(draw, in_axes=(0, None, None)))(
-            jax.random.split(jax.random.key(1), 300), labels, size_px
-        )
-        crops = (
-            cut_of(
-                jax.tree.map(lambda leaf, i=i: leaf[i], views), np.zeros((*labels.shape, 3), np.uint8), labels, size_px
-            )
-            for i in range(300)
-        )
-        return float(np.mean([(near == 2).any() for _, near in crops]))
+        @jax.jit
+        @jax.vmap
+        def rare(key: jax.Array) -> jax.Array:
+            window = draw_window(key, labels, size_px, replace(enlarged, class_share=class_share))
+            return (cut_nearest(window, labels, size_px, CROP_PX, IGNORE) == 2).any()
+
+        return float(rare(jax.random.split(jax.random.key(1), 300)).mean())
 
     assert held(0.0) < 0.15
     assert 0.4 < held(1.0) < 0.65, "one of two classes is chosen"

@@ -117,6 +117,7 @@ def test_the_pull_back_is_the_gradient_of_the_loss(trainer, weights):
     assert 0.7 < float(loss - after) / (1e-3 * length) < 1.3
 
 
+@pytest.mark.slow
 def test_a_batch_of_more_frames_takes_no_more_memory(trainer, weights):
     taken = {}
     for count in (2, 8):

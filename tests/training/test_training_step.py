@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -192,21 +193,18 @@ def test_dropout_differs_from_step_to_step(frozen):
 
 def test_the_loss_of_a_step_is_that_of_its_examples(learning):
     batch = batch_of(False)
-    view_key, dropout_key = jax.random.split(jax.random.key(5))
+    augment_key, dropout_key = jax.random.split(jax.random.key(5))
     fill = tuple(255 * value for value in ARCHITECTURE.mean)
-    crops, labels = [], []
-    for place in range(2):
-        drawn = jax.random.fold_in(jax.random.fold_in(view_key, 0), place)
-        words = (batch.images[place], batch.labels[place], batch.sizes_px[place], jnp.array(False))
-        crop, near = augment(drawn, *words, LEARNING.augmentation, fill)
-        crops.append(crop)
-        labels.append(near)
+    draw = jax.jit(partial(augment, options=LEARNING.augmentation, fill=fill))
+    keys = [jax.random.fold_in(jax.random.fold_in(augment_key, 0), place) for place in range(2)]
+    drawn = [draw(key, *(array[place] for array in batch[:3]), jnp.array(False)) for place, key in enumerate(keys)]
+    crops, labels = zip(*drawn, strict=True)
     loss, (logits, _) = jax.jit(learning.trainer.loss)(
         learning.weights, jnp.stack(crops), jnp.stack(labels), dropout_key
     )
     _, info = learning.step(learning.init(), batch, key=5)
     assert float(info.loss) == pytest.approx(float(loss), rel=1e-3)
-    right = (np.asarray(logits).argmax(axis=-1) == labels)[np.array(labels) != 255]
+    right = (np.asarray(logits).argmax(axis=-1) == np.array(labels))[np.array(labels) != 255]
     assert float(info.accuracy) == pytest.approx(right.mean(), abs=0.01)
 
 
