@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 
 import pytest
 import yaml
@@ -150,7 +150,27 @@ def test_every_fault_is_named_by_its_key(tree, named):
     assert "mine.yaml" in str(caught.value)
 
 
-def test_options_go_before_the_config(tmp_path):
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: AugmentationOptions(scale=(2, 1)), "augmentation.scale is 2.0 1.0"),
+        (lambda: AugmentationOptions(crop_px=(8, 384)), "augmentation.crop_px.0 is 8"),
+        (lambda: PixelLossOptions(cross_entropy=0), "every loss has a weight of 0"),
+        (lambda: OptimiserOptions(learning_rate=-1, momentum=2), "optimiser.learning_rate is -1"),
+        (lambda: OptimiserOptions(learning_rate=-1, momentum=2), "optimiser.momentum is 2"),
+        (lambda: DataOptions(validation_share=1), "data.validation_share is 1"),
+        (lambda: TrainConfig(epochs=0), "epochs is 0"),
+        (lambda: TrainConfig(epoch=1), "unknown key epoch"),
+        (lambda: replace(TrainConfig(), keep="first"), "keep is 'first'"),
+    ],
+)
+def test_options_are_validated_when_they_are_made(make, named):
+    with pytest.raises(UsageError) as caught:
+        make()
+    assert named in str(caught.value)
+
+
+def test_options_override_the_config(tmp_path):
     from jaxmap.commands.console import parse
     from jaxmap.commands.train import TrainArguments, _with_config
 

@@ -338,6 +338,9 @@ def test_files_that_no_training_has_written_are_never_replaced(options, plan, tm
     (run / "checkpoints" / "epoch7.pt").write_text("another's")
     (run / "config.yaml").write_text("model: unet\n")
     assert "config.yaml, checkpoints would be replaced" in refused(plan, run, **options)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "history.csv").write_text("another's")
+    assert "history.csv would be replaced" in refused(plan, tmp_path / "other", **options)
 
 
 def test_the_model_started_from_is_not_overwritten(plan, run_copy):
