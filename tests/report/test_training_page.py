@@ -20,20 +20,19 @@ from test_report_browser import browse
 
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
 from jaxmap.labels import IGNORE, class_colours
+from jaxmap.report import training_charts as charts
 from jaxmap.report import training_page as report
+from jaxmap.report.training_charts import ACCENT, Line, line_chart
 from jaxmap.report.training_page import (
-    ACCENT,
     MAX_EXAMPLES,
     MISSED,
     PANEL_WIDTH_PX,
     WRONG,
-    Line,
     TrainingRecord,
     class_table,
     confusion_table,
     duration_text,
     error_picture,
-    line_chart,
     score_text,
     training_page,
 )
@@ -107,13 +106,13 @@ def test_the_page_holds_all_of_a_run() -> None:
     page = training_page(make_record())
     for heading in ("Curves", "Scores", "Examples", "Recipe"):
         assert f"<h2>{heading}</h2>" in page
-    charts = charts_of(page)
-    assert list(charts) == [
+    found = charts_of(page)
+    assert list(found) == [
         *("Loss by epoch", "IoU of each class by epoch", "Learning rate by epoch"),
         *("Images per second by epoch", "Accuracy over confidence"),
     ]
-    assert {"validation", "training", "best", "epoch", "loss"} <= set(texts(charts["Loss by epoch"]))
-    assert {"mean", "sand"} <= set(texts(charts["IoU of each class by epoch"]))
+    assert {"validation", "training", "best", "epoch", "loss"} <= set(texts(found["Loss by epoch"]))
+    assert {"mean", "sand"} <= set(texts(found["IoU of each class by epoch"]))
     assert "9 of 12" in page and "18&nbsp;min" in page
     assert len(pictures_of(page)) == 8
 
@@ -272,30 +271,30 @@ def test_of_many_lines_the_strong_and_the_lowest_are_named() -> None:
 
 def test_lines_of_classes_take_the_colours_of_the_page() -> None:
     page = training_page(make_record())
-    for index, ink in enumerate(report._inks(CLASSES, report.LIGHT_PANEL)):
-        assert f"--class-{index}:{report.hex_of(ink)};" in page and f"var(--class-{index})" in page
+    for index, ink in enumerate(charts.class_inks(CLASSES, charts.LIGHT_PANEL)):
+        assert f"--class-{index}:{charts.hex_of(ink)};" in page and f"var(--class-{index})" in page
 
 
 # --- colours
 
 
-@given(st.tuples(*[st.integers(0, 255)] * 3), st.sampled_from([report.LIGHT_PANEL, report.DARK_PANEL]))
+@given(st.tuples(*[st.integers(0, 255)] * 3), st.sampled_from([charts.LIGHT_PANEL, charts.DARK_PANEL]))
 def test_inks_can_be_read_on_their_ground(colour, ground) -> None:
-    ink = report.with_contrast(colour, ground)
-    assert report.contrast(ink, ground) >= report.LEAST_CONTRAST
-    assert ink == colour or report.contrast(colour, ground) < report.LEAST_CONTRAST
+    ink = charts.with_contrast(colour, ground)
+    assert charts.contrast(ink, ground) >= charts.LEAST_CONTRAST
+    assert ink == colour or charts.contrast(colour, ground) < charts.LEAST_CONTRAST
 
 
 def test_contrast_is_that_of_the_standard() -> None:
-    assert report.contrast((0, 0, 0), (255, 255, 255)) == pytest.approx(21)
+    assert charts.contrast((0, 0, 0), (255, 255, 255)) == pytest.approx(21)
     # The lightest grey that WCAG passes on white.
-    assert report.contrast((118, 118, 118), (255, 255, 255)) == pytest.approx(4.54, abs=0.01)
+    assert charts.contrast((118, 118, 118), (255, 255, 255)) == pytest.approx(4.54, abs=0.01)
 
 
 def test_every_class_has_inks_of_its_own() -> None:
-    sheet = report.class_inks(("sand", "rock"))
+    sheet = charts.class_style(("sand", "rock"))
     assert sheet.count("--class-0:") == sheet.count("--class-1:") == 2
-    assert f"--class-1:{report.hex_of(class_colours(('sand', 'rock'))[1])};" in sheet
+    assert f"--class-1:{charts.hex_of(class_colours(('sand', 'rock'))[1])};" in sheet
 
 
 @pytest.mark.browser
