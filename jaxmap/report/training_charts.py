@@ -75,7 +75,7 @@ def line_chart(
             dots = {"marker": "o", "markersize": 5 if line.strong else 4} if len(line.points) <= MAX_DOTS else {}
             width = 2.6 if line.strong else 1.6
             plot.plot(*zip(*line.points, strict=True), color=line.colour, linewidth=width, clip_on=False, **dots)
-        # Where there is no room for all names, those of strong and of low lines are kept: the worst classes matter most.
+        # Where there is no room for all names, those of strong and of low lines are kept: the worst matter most.
         named = sorted((line for line in lines if line.name), key=lambda line: (not line.strong, line.points[-1][1]))
         at_most = min(MAX_NAMES, height_px // 18)
         named = sorted(named[:at_most], key=lambda line: -line.points[-1][1])

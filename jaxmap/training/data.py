@@ -126,14 +126,8 @@ def read_example(example: Example, lookup: MaskLookup) -> tuple[Pixels, Labels]:
     return image, labels
 
 
-def check_training_set(
-    training_set: TrainingSet, advance: Callable[[int], None] = lambda done: None
-) -> Int64[np.ndarray, "2 C"]:
+def check_training_set(training_set: TrainingSet) -> Int64[np.ndarray, "2 C"]:
     """Reads every image and mask once, so that no fault is found hours later.
-
-    Args:
-        training_set: what to read.
-        advance: called with the number of examples read so far.
 
     Returns:
         Pixels of each class in training (row 0) and in validation (row 1).
@@ -156,7 +150,7 @@ def check_training_set(
         return np.bincount(lookup.table[codes].ravel(), minlength=256)
 
     counts = np.zeros((2, 256), np.int64)
-    for (row, _), found in zip(examples, _in_threads(count, examples, advance), strict=True):
+    for (row, _), found in zip(examples, _in_threads(count, examples), strict=True):
         counts[row] += found
     if counts[:, UNNAMED].any():
         unnamed = np.flatnonzero(seen.any(axis=0) & (lookup.table == UNNAMED)).tolist()
@@ -205,9 +199,7 @@ def _check_size(mask: np.ndarray, example: Example) -> None:
         )
 
 
-def _in_threads(
-    work: Callable[[Item], Result], items: Sequence[Item], advance: Callable[[int], None] = lambda done: None
-) -> list[Result]:
+def _in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """The result of each item, in order; Pillow and NumPy let threads run side by side.
 
     Raises:
@@ -216,12 +208,11 @@ def _in_threads(
     threads = ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1))
     try:
         futures = [threads.submit(work, item) for item in items]
-        for done, future in enumerate(as_completed(futures)):
+        for future in as_completed(futures):
             if not isinstance(future.exception(), JaxmapError | None):
                 future.result()
-            advance(done + 1)
     finally:
-        # An interrupted check must not go on to the last file.
+        # An interrupted check must not continue to the last file.
         threads.shutdown(cancel_futures=True)
     faults = [fault for future in futures if isinstance(fault := future.exception(), JaxmapError)]
     if len(faults) > 1:

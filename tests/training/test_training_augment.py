@@ -53,7 +53,7 @@ def view_of(scale: float, offset_px: tuple[int, int], mirrored: bool) -> CropWin
 
 
 def example(size_px: tuple[int, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image and its labels, 0 to 4 and `IGNORE`; what pads them is told apart: white, of label 99."""
+    """An image and its labels, 0 to 4 and `IGNORE`; the padding is white, of label 99."""
     draw = np.random.default_rng(seed)
     image = np.full((*STORED_PX, 3), 255, np.uint8)
     labels = np.full(STORED_PX, 99, np.uint8)
@@ -76,7 +76,7 @@ def lit(*words: tuple) -> tuple[np.ndarray, np.ndarray]:
 
 
 def coded(size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """An image in bands of flat colour that tell the label: red is 50 for each label."""
+    """An image in bands of flat colour by label: red is 50 for each label."""
     rows, columns = np.indices(STORED_PX)
     labels = ((rows // 4 + columns // 5) % 4).astype(np.uint8)
     labels[size_px[0] :], labels[:, size_px[1] :] = 99, 99

@@ -156,7 +156,7 @@ def test_without_copies_each_epoch_draws_anew(pixels):
     assert not any(np.array_equal(crops[0, example], crops[1, example]) for example in range(3))
 
 
-def test_an_image_that_is_gone_is_told(opened, tmp_path):
+def test_an_image_that_is_gone_is_reported(opened, tmp_path):
     lost = opened.train[0]._replace(image=Path(tmp_path / "gone.png"))
     with pytest.raises(JaxmapError, match=r"gone\.png"):
         list(batches_from(ExampleReader((lost,), opened.lookup), order_of(1, 1, 1), 0))

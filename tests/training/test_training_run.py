@@ -124,7 +124,7 @@ def go(
 
 
 def refused(plan: TrainingPlan, out: Path, kind: type[JaxmapError] = JaxmapError, **options: bool) -> str:
-    """The error of a run that may not begin or go on, which changes nothing."""
+    """The error of a run that may not begin or resume, which changes nothing."""
     before = contents(out)
     with pytest.raises(JaxmapError) as caught:
         go(plan, out, **options)
@@ -415,7 +415,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_its_images(plan, whol
     assert [row["epoch"] for row in history_of(run)] == ["1", "2"]
     assert "Stopped: loss nan" in (run / "report.html").read_text()
     assert not metrics_of(run)["complete"]
-    # What was kept is good: the run can go on from there.
+    # What was kept is good: the run can resume from there.
     go(plan, run, resume=True)
     same_run(run, whole_run)
 

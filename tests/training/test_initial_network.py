@@ -149,7 +149,7 @@ def test_fresh_networks_see_at_several_scales_in_either_family(stride, rates):
         ({"backbone": "frozen", "head": "batch"}, ("aspp", "decoder")),
     ],
 )
-def test_norms_learn_where_they_are_told_to(norm, expected):
+def test_norms_train_as_the_options_say(norm, expected):
     assert start_of(saved(holds="backbone"), **norm).batch_norms == expected
 
 
