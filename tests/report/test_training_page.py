@@ -298,7 +298,11 @@ def test_every_class_has_inks_of_its_own() -> None:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize(("scheme", "size"), [(1, (1280, 1600)), (0, (500, 1600))], ids=["light", "narrow and dark"])
+@pytest.mark.parametrize(
+    ("scheme", "size"),
+    [pytest.param(1, (1280, 1600), marks=pytest.mark.slow), (0, (500, 1600))],
+    ids=["light", "narrow and dark"],
+)
 def test_the_page_in_a_browser(tmp_path, scheme, size) -> None:
     probe = (
         "<script>document.documentElement.dataset.wider = document.documentElement.scrollWidth > innerWidth</script>"

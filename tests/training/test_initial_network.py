@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from golden.seeded_weights import seeded_weights
+from tiny_training import compiled_quickly
 
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
@@ -14,6 +15,8 @@ from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import weight_shapes
 from jaxmap.training.initial_network import InitialNetwork, make_initial_network
 from jaxmap.training.options import BatchNormOptions, NetworkOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 CLASSES = ("background", "sand", "rock")
 SMALL = NetworkOptions(head_channels=8, low_level_channels=4, atrous_rates=(2,), top_conv=False)

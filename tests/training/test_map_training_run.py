@@ -120,6 +120,7 @@ def history_of(run: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k not in ("seconds", "images_per_s")} for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_a_run_writes_what_a_run_on_images_writes(finished, place):
     written = {path.name for path in finished.iterdir()}
     assert written == {"model.safetensors", "history.csv", "metrics.json", "config.yaml", "report.html", "checkpoints"}
@@ -139,6 +140,7 @@ def test_a_run_writes_what_a_run_on_images_writes(finished, place):
     assert "no image is labelled" in page and "true cells" in page
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_exactly(plan, finished, tmp_path, monkeypatch):
     def cut(self, epoch, state, meter):
         whole(self, epoch, state, meter)

@@ -12,6 +12,7 @@ import pytest
 import reference_augment
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from tiny_training import compiled_quickly
 
 from jaxmap.labels import IGNORE
 from jaxmap.training.augment import (
@@ -25,6 +26,8 @@ from jaxmap.training.augment import (
     whole_window,
 )
 from jaxmap.training.options import AugmentationOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 STORED_PX = (20, 24)
 """Images are padded to this, so that each function is compiled once for all sizes."""

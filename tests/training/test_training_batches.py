@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_training import compiled_quickly
 from training_data import CLASSES, scene, write_pair
 
 from jaxmap.errors import JaxmapError
@@ -18,6 +19,8 @@ from jaxmap.training.augment import augment
 from jaxmap.training.batches import ExampleOrder, ExampleReader, batches_from
 from jaxmap.training.data import TrainingSet, open_training_set
 from jaxmap.training.options import AugmentationOptions, DataOptions, TrainingOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 SIZES_PX = ((20, 30), (25, 17), (16, 16))
 

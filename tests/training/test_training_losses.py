@@ -12,11 +12,14 @@ import pytest
 import reference_losses
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_training import compiled_quickly
 
 from jaxmap.errors import UsageError
 from jaxmap.labels import IGNORE
 from jaxmap.training.losses import class_weights, total_loss
 from jaxmap.training.options import PixelLossOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 PIXELS, CLASSES = 24, 3
 EQUAL = np.ones(CLASSES, np.float32)
