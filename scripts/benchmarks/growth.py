@@ -8,9 +8,9 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jaxmap.report.inks import LIGHT_PANEL, Rgb, with_contrast
 from jaxmap.report.plan_sheet import FAINT, INK
 from jaxmap.report.scales import fitting_scale, spread
+from jaxmap.report.training_charts import LIGHT_PANEL, Rgb, with_contrast
 from jaxmap.report.wording import number_text
 
 if TYPE_CHECKING:
