@@ -171,6 +171,7 @@ def test_the_average_runs_behind_the_weights(learning):
         np.testing.assert_allclose(state.average[name], mean, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_what_is_frozen_stays_to_the_last_bit(frozen):
     state, infos = frozen.run(5, batch_of(False))
     moved = {name for name, value in state.weights.items() if not np.array_equal(value, frozen.weights[name])}
@@ -181,6 +182,7 @@ def test_what_is_frozen_stays_to_the_last_bit(frozen):
     assert not any("backbone" in name for name in host(state) if ".optimiser" in name), "no moments for what is fixed"
 
 
+@pytest.mark.slow
 def test_dropout_differs_from_step_to_step(frozen):
     """With the rate at its end nothing moves, and only what is dropped changes the loss."""
     state, one = frozen.step(frozen.init(step=jnp.array(1000, jnp.int32)), batch_of())
