@@ -12,7 +12,8 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
-from jaxmap.runs.training_plan import TrainConfig, check_train_config, load_train_config, train_config_tree
+from jaxmap.runs.config import check_config, config_tree
+from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainConfig
 
 OUTPUTS = ("report.html", "model.safetensors", "history.csv", "metrics.json", "config.yaml", "checkpoints/")
 
@@ -22,10 +23,10 @@ class TrainArguments:
     """Train or fine-tune DeepLabv3+ on images and masks, or on a stereo sequence and an orthomosaic.
 
     The folder holds images/NAME.{png,jpg,...} and masks/NAME.png, and may hold train.txt and val.txt of names.
-    With --supervision map it is a sequence, as of jaxmap map, or sample:NAME, and no image is labelled: the network,
-    the bundled one if --init names no other, learns to make the map that --ground-truth shows from above.
+    With --supervision map it is a sequence, as of jaxmap map, or sample:NAME, and no image is labelled: the network
+    (the bundled one without --init) learns to make the map that the orthomosaic of --ground-truth shows.
     Writes into the run folder: model.safetensors, history.csv, metrics.json, config.yaml, report.html and
-    checkpoints/, from which an interrupted run goes on exactly (--resume).
+    checkpoints/, from which an interrupted run is resumed exactly (--resume).
     """
 
     data_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")]
@@ -35,18 +36,20 @@ class TrainArguments:
     init: Path | None = None
     """Model file to start from: a backbone or a whole network, as train and weights write it."""
     config: str | None = None
-    """YAML file, or the name of one in configs/train (chiodini2020); options given here go before it."""
+    """YAML file, or the name of one in configs/train (chiodini2020); options given here override it."""
     resume: bool = False
-    """Go on with an interrupted run."""
+    """Resume an interrupted run."""
     overwrite: bool = False
-    """Replace a run that lies in the folder."""
+    """Replace the run in the folder."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
 
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(TrainArguments, "train", words, with_config=_with_config)
-    config = check_train_config(train_config_tree(arguments.settings))
+    config = arguments.settings
+    # `MapConfig` is not validated when it is made.
+    check_config(config_tree(config.mapping))
     if arguments.resume and arguments.overwrite:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
 
@@ -54,7 +57,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.host.output_folder import locked
     from jaxmap.runs.map_training import plan_map_training
     from jaxmap.runs.training import TrainingFolder, TrainingRun
-    from jaxmap.runs.training_plan import plan_training
+    from jaxmap.runs.training_plan import plan_image_training
 
     keep_compiled_programs()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -62,30 +65,26 @@ def main(words: Sequence[str]) -> int:
     if config.supervision == "pixels" and config.ground_truth is not None:
         raise UsageError("--ground-truth is given, but pixels supervise", fix="add --supervision map, or leave it out")
     folder = TrainingFolder(arguments.out)
-    # All data are read for the plan: a folder that cannot be written is told before.
+    # The plan reads all data: a folder that cannot be written is reported before.
     with locked(arguments.out):
         if config.supervision == "map":
             plan = plan_map_training(str(arguments.data_folder), config, arguments.init, notify=console.notify)
         else:
-            plan = plan_training(arguments.data_folder, config, arguments.init, notify=console.notify)
+            plan = plan_image_training(arguments.data_folder, config, arguments.init, notify=console.notify)
         folder.begin(plan, resume=arguments.resume, overwrite=arguments.overwrite)
         with console.steps("training", "steps", plan.order.steps) as advance:
             metrics = TrainingRun(plan, folder, notify=console.notify, on_step=advance).run()
-    console.notify(_summary(metrics))
+    rate = metrics["examples_seen"] / max(metrics["seconds"], 1e-9)
+    summary = f"{metrics['epochs']} epochs: {metrics['examples_seen']} examples, {rate:.1f} a second"
+    if metrics["kept_epoch"] is not None:
+        kept = metrics["last"] if metrics["kept_epoch"] == metrics["last"]["epoch"] else metrics["best"]
+        iou = "unknown" if kept["mean_iou"] is None else f"{kept['mean_iou']:.3f}"
+        summary += f"; kept: epoch {metrics['kept_epoch']}, mean IoU {iou}"
+    console.notify(summary)
     console.result(arguments.out, OUTPUTS)
     return 0
 
 
-def _summary(metrics: dict) -> str:
-    rate = metrics["examples_seen"] / max(metrics["seconds"], 1e-9)
-    line = f"{metrics['epochs']} epochs: {metrics['examples_seen']} examples, {rate:.1f} a second"
-    if metrics["kept_epoch"] is not None:
-        kept = metrics["last"] if metrics["kept_epoch"] == metrics["last"]["epoch"] else metrics["best"]
-        iou = "unknown" if kept["mean_iou"] is None else f"{kept['mean_iou']:.3f}"
-        line += f"; kept: epoch {metrics['kept_epoch']}, mean IoU {iou}"
-    return line
-
-
 def _with_config(name: str) -> TrainArguments:
     """The defaults under a configuration; the two required arguments are filled in by the parser."""
-    return TrainArguments(data_folder=tyro.MISSING, out=tyro.MISSING, config=name, settings=load_train_config(name))
+    return TrainArguments(data_folder=tyro.MISSING, out=tyro.MISSING, config=name, settings=TRAIN_SETTINGS.load(name))

@@ -21,11 +21,11 @@ Probability = Interval(gt=0, lt=1)
 
 
 @dataclass_transform(frozen_default=True)
-def options(section: str) -> Callable[[type[Config]], type[Config]]:
+def options(section: str = "") -> Callable[[type[Config]], type[Config]]:
     """Makes a frozen dataclass whose fields are checked whenever one is made, from Python, YAML or the command line.
 
     Args:
-        section: where it stands in a configuration; errors name its fields below it. Empty for the top.
+        section: where it stands in a configuration; errors name its fields below it. Empty at the top.
 
     Raises:
         UsageError: on making one of unknown or illegal values; names them all.
@@ -41,7 +41,7 @@ def options(section: str) -> Callable[[type[Config]], type[Config]]:
             try:
                 initialise(self, *args, **values)
             except ValidationError as error:
-                raise UsageError(_complaints(error, section), fix="see the options' bounds (--help)") from error
+                raise UsageError(_complaints(error, section), fix="choose a valid value") from error
 
         made.__init__ = checked
         return made

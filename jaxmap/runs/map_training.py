@@ -1,9 +1,10 @@
-"""A training run by map supervision, decided in full before the first step: `jaxmap train --supervision map`."""
+"""The plan of a training run with map supervision: frames, orthomosaic, network and compiled step."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from jaxmap.datasets.crs import Extent, read_crs
 from jaxmap.datasets.label_raster import LabelRaster, choose_coding, read_label_orthomosaic
-from jaxmap.errors import JaxmapError, UsageError, options_as, with_options
+from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import CellGrid
 from jaxmap.evaluation.evaluate import evaluate_map
 from jaxmap.evaluation.options import ScoringOptions
@@ -31,21 +32,20 @@ from jaxmap.models.deeplab import Weights, fold_batch_norm
 from jaxmap.runs.evaluation import class_layer_of
 from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.runs.segmentation import Segmenter
-from jaxmap.runs.training_plan import TaughtMapping, TrainConfig, TrainingPlan, check_scale, describe_start, option_here
-from jaxmap.training.batches import BATCHES_AHEAD, Order
+from jaxmap.runs.training_plan import SupervisedMapConfig, TrainConfig, TrainingPlan, describe_network
+from jaxmap.training.batches import BATCHES_AHEAD, ExampleOrder
+from jaxmap.training.initial_network import make_initial_network
 from jaxmap.training.losses import class_weights
-from jaxmap.training.starts import make_start
-from jaxmap.training.validation import SHOWN as MOST_SHOWN
-from jaxmap.training.validation import Shown, Validation
+from jaxmap.training.validation import MAX_EXAMPLES, Validation, ValidationExample
 from jaxmap.tuning.frame_crops import FrameBatch
 from jaxmap.tuning.map_loss import MapTruth, make_map_truth
 from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
 from jaxmap.tuning.options import MapLossOptions
-from jaxmap.types import Frame, VoxelMap
+from jaxmap.types import Frame
 
 
-class KeptFrame(NamedTuple):
-    """A frame as the step takes it, what its pixels are held to, and the class of the cell that each pixel lies in."""
+class TrainingFrame(NamedTuple):
+    """A prepared frame, the anchors of its pixels, and the class of the cell that each pixel's point lies in."""
 
     name: str
     frame: Frame
@@ -54,12 +54,12 @@ class KeptFrame(NamedTuple):
 
 
 class CellTruth(NamedTuple):
-    """An orthomosaic over the cells of a map.
+    """An orthomosaic, resampled to the cells of a map.
 
     Attributes:
-        rasters: by the index of each class that it shows.
-        cells: their grid.
-        labels: the class of each cell, `IGNORE` where there is none.
+        rasters: of each class that it shows, by index of the class.
+        cells: the grid.
+        labels: the class of each cell, or `IGNORE`.
     """
 
     rasters: Mapping[int, LabelRaster]
@@ -67,7 +67,7 @@ class CellTruth(NamedTuple):
     labels: UInt8[np.ndarray, "I J"]
 
     def of_points(self, points_world: Float[np.ndarray, "*s 3"]) -> UInt8[np.ndarray, "*s"]:
-        """The class of the cells that points lie in, world; `IGNORE` where there is none."""
+        """The class of the cells that points (world, metres) lie in, or `IGNORE`."""
         rows, columns = (
             np.floor((points_world[..., axis] - self.cells.origin_m[axis]) / self.cells.size_m) for axis in (0, 1)
         )
@@ -78,21 +78,21 @@ class CellTruth(NamedTuple):
 
 
 @dataclass(frozen=True)
-class MapData:
+class MapTrainingData:
     """A sequence and its orthomosaic, as `TrainingData`.
 
     Attributes:
-        plan: how the sequence is mapped.
+        plan: of the mapping.
         truth: the orthomosaic.
-        train: frames that are learnt from.
-        validation: frames that are held out, from the end of the sequence.
-        truth_name: of the orthomosaic, for the page.
+        train: training frames.
+        validation: held-out frames, from the end of the sequence.
+        truth_name: file name of the orthomosaic, for the page.
     """
 
     plan: Plan
     truth: CellTruth
-    train: tuple[KeptFrame, ...]
-    validation: tuple[KeptFrame, ...]
+    train: tuple[TrainingFrame, ...]
+    validation: tuple[TrainingFrame, ...]
     truth_name: str
 
     @property
@@ -107,11 +107,11 @@ class MapData:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the frames that are learnt from."""
+        """Names of the training frames."""
         return tuple(kept.name for kept in self.train)
 
-    def batches(self, order: Order, first_step: int) -> Iterator[FrameBatch]:
-        """The batches of a run from a step on."""
+    def batches(self, order: ExampleOrder, first_step: int) -> Iterator[FrameBatch]:
+        """The batches of a run from `first_step` on."""
         return prefetch(
             lambda step: self._batch(order.draws(step)), range(first_step, order.steps), workers=1, ahead=BATCHES_AHEAD
         )
@@ -128,7 +128,7 @@ class MapData:
         )
 
     def validator(self, architecture: Architecture) -> MapValidator | None:
-        """Scores the map of the held-out frames; None where there are none."""
+        """Scores the map of the held-out frames; None without any."""
         return MapValidator(self, architecture) if self.validation else None
 
     def digest(self) -> str:
@@ -161,7 +161,7 @@ class MapData:
         }
 
 
-def class_pixels(frames: tuple[KeptFrame, ...], count: int) -> np.ndarray:
+def class_pixels(frames: tuple[TrainingFrame, ...], count: int) -> np.ndarray:
     """Pixels that lie in cells of each class."""
     counted = np.zeros(count, np.int64)
     for kept in frames:
@@ -170,14 +170,14 @@ def class_pixels(frames: tuple[KeptFrame, ...], count: int) -> np.ndarray:
 
 
 class MapValidator:
-    """Scores weights by the map that they make of the held-out frames.
+    """Scores the map that weights make of the held-out frames.
 
     Args:
         data: the frames and the truth.
         architecture: of the network.
     """
 
-    def __init__(self, data: MapData, architecture: Architecture) -> None:
+    def __init__(self, data: MapTrainingData, architecture: Architecture) -> None:
         self._data = data
         # Two jitted functions: inside one, XLA would fold the batch norms anew for every frame.
         self._fold = jax.jit(lambda weights: fold_batch_norm(architecture, weights)[1])
@@ -186,17 +186,17 @@ class MapValidator:
         """Scores weights.
 
         Raises:
-            JaxmapError: the network's answer is not finite.
+            JaxmapError: the map is not finite.
         """
         data, plan = self._data, self._data.plan
         labelling = plan.params.labeller
         labelling = labelling._replace(weights=self._fold(weights))
         params = MapperParams(plan.params.camera, plan.params.fusion, labelling)
-        voxel_map, shown = plan.mapper.init(), []
+        voxel_map, examples = plan.mapper.init(), []
         for number, kept in enumerate(data.validation):
-            if number < MOST_SHOWN:
-                said = np.asarray(plan.mapper.label_image(kept.frame, params, plan.key, number))
-                shown.append(Shown(kept.name, np.asarray(kept.frame.image), kept.cells, said))
+            if number < MAX_EXAMPLES:
+                labels = np.asarray(plan.mapper.label_image(kept.frame, params, plan.key, number))
+                examples.append(ValidationExample(kept.name, np.asarray(kept.frame.image), kept.cells, labels))
             voxel_map, _ = plan.mapper.step(voxel_map, kept.frame, params, plan.key)
         if not np.isfinite(np.asarray(voxel_map.log_odds)).all():
             raise JaxmapError(
@@ -204,10 +204,6 @@ class MapValidator:
                 where=plan.sequence.name,
                 fix="take a lower optimiser.learning-rate and start anew",
             )
-        return self._scored(voxel_map, tuple(shown))
-
-    def _scored(self, voxel_map: VoxelMap, shown: tuple[Shown, ...]) -> Validation:
-        data, plan = self._data, self._data.plan
         options = ScoringOptions(cell_size_m=data.truth.cells.size_m)
         classes: dict[str, dict[str, Any]] = {}
         for index, raster in data.truth.rasters.items():
@@ -234,14 +230,14 @@ class MapValidator:
             "pixels": max(scores["cells"] for scores in classes.values()),
             "unit": "cell",
         }
-        return Validation(summary, float(np.mean([scores["nll"] for scores in classes.values()])), shown)
+        return Validation(summary, float(np.mean([scores["nll"] for scores in classes.values()])), tuple(examples))
 
 
 MAX_FRAME_BYTES = 4 * 2**30
-"""All frames are held in memory."""
+"""All frames are kept in memory."""
 
-_OF_THE_NETWORK = ("labeller", "model", "model_sha256", "labels", "labels_are", "classes")
-"""Settings of a mapping that say what labels; here that is the network which is trained."""
+_LABELLER_SETTINGS = ("labeller", "model", "model_sha256", "labels", "labels_are", "classes")
+"""Settings of a mapping that choose the labeller, which here is the network in training."""
 
 
 def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, notify: Notify) -> TrainingPlan:
@@ -250,36 +246,41 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
     Args:
         source: the folder of one sequence, or `sample:NAME`.
         config: the settings.
-        init: the network to start from; the bundled one by default.
+        init: model file of the network to start from; the bundled one by default.
         notify: takes lines for the user.
 
     Raises:
-        JaxmapError: sequence, orthomosaic, settings and network do not serve.
+        JaxmapError: sequence, orthomosaic, settings or network are unusable.
     """
-    _check(config)
+    _check_settings(config)
     assert config.ground_truth is not None
     path = init or bundled("rover.safetensors")
     saved = load_network(path)
-    start = make_start(config.network, config.norm, config.classes, saved, seed=config.seed, where=path)
-    if start.fresh or start.batch_norms:
-        what = f"{', '.join(start.fresh)} would be random" if start.fresh else "batch norm would learn"
+    network = make_initial_network(config.network, config.norm, config.classes, saved, seed=config.seed, where=path)
+    if network.fresh or network.batch_norms:
+        what = f"{', '.join(network.fresh)} would be random" if network.fresh else "batch norm would be trained"
         raise UsageError(
-            f"map supervision teaches a network that knows the classes already: {what}",
+            f"map supervision needs a network that was trained for the classes: {what}",
             where=path,
             fix="train it on images first, and leave --classes, network and norm as they are there",
         )
     mapping = replace(config.mapping, model=path, classes=config.classes)
-    with options_as(option_here):
-        plan = plan_run(source, mapping, lambda line: notify(with_options(line, option_here)))
-        truth, truths = read_cells(plan, config)
-        frames = keep_frames(plan, truth, saved, config.map_truth.anchor, notify)
+    with _naming_options_of("map", "mapping") as named:
+        plan = plan_run(source, mapping, lambda line: notify(named(line)))
+    truth, truths = read_cells(plan, config)
+    frames = prepare_training_frames(plan, truth, saved, config.map_truth.anchor, notify)
     train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
-    data = MapData(plan, truth, train, validation, config.ground_truth.name)
+    data = MapTrainingData(plan, truth, train, validation, config.ground_truth.name)
     counts = class_pixels(train, len(config.classes))
     _check_shown(counts, data, config)
-    notify(_told(data, counts))
-    notify(describe_start(start))
-    order = Order.of(len(train), config)
+    pixels, seen = sum(kept.cells.size for kept in train), int(counts.sum())
+    shares = ", ".join(f"{config.classes[index]} {counts[index] / seen:.1%}" for index in truth.rasters)
+    notify(
+        f"{len(train)} frames to map, {len(validation)} to validate; "
+        f"{seen / pixels:.0%} of their pixels lie in labelled cells: {shares}"
+    )
+    notify(describe_network(network))
+    order = ExampleOrder.of(len(train), config)
     site = Site(
         camera=plan.front_end.camera,
         grid=plan.grid,
@@ -291,39 +292,49 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
         anchor=config.map_truth.anchor,
         temperature=config.map_truth.temperature,
     )
-    trainer = make_map_trainer(start.architecture, config, site, steps=order.steps)
-    return TrainingPlan(config, data, start, path, order, trainer)
+    trainer = make_map_trainer(network.architecture, config, site, steps=order.steps)
+    return TrainingPlan(config, data, network, path, order, trainer)
 
 
-def _check(config: TrainConfig) -> None:
-    """Refuses settings that mean nothing here."""
+def _check_settings(config: TrainConfig) -> None:
+    """Refuses settings that have no effect with map supervision."""
     if config.ground_truth is None:
         raise UsageError("map supervision needs an orthomosaic", fix="give --ground-truth F.tif")
-    check_scale(config)
     losses = config.loss
     if losses.lovasz or losses.label_smoothing:
         raise UsageError(
             "loss.lovasz and loss.label_smoothing are of pixels", where="--supervision map", fix="leave them out"
         )
-    if not (losses.cross_entropy or losses.soft_iou):
-        raise UsageError("every loss has a weight of 0", where="loss", fix="give one of them a weight")
     if config.augmentation.copies is not None:
         raise UsageError("augmentation.copies is for images", where="--supervision map", fix="leave it out")
     if jax.local_device_count() > 1:
         raise UsageError("map supervision runs on one device", fix="hide the others (CUDA_VISIBLE_DEVICES=0)")
-    plain = TaughtMapping()
-    if named := [name for name in _OF_THE_NETWORK if getattr(config.mapping, name) != getattr(plain, name)]:
+    plain = SupervisedMapConfig()
+    if named := [name for name in _LABELLER_SETTINGS if getattr(config.mapping, name) != getattr(plain, name)]:
         raise UsageError(
-            f"mapping.{named[0]} says nothing here: the network that is trained labels",
+            f"mapping.{named[0]} has no effect: the network in training labels",
             where="--supervision map",
             fix="name the network with --init and its classes with --classes",
         )
     if config.mapping.ensemble.members:
         raise UsageError(
-            "mapping.ensemble.members says nothing here: the network learns from one map",
+            "mapping.ensemble.members has no effect: the network learns from one map",
             where="--supervision map",
             fix="leave it out",
         )
+
+
+@contextmanager
+def _naming_options_of(command: str, section: str) -> Iterator[Callable[[str], str]]:
+    """Says of errors that name options of another command, and of lines it is given, where those stand in train."""
+
+    def named(text: str, whole: str = "") -> str:
+        return f"jaxmap {command} (options below {section}): {text}" if "--" in text + whole else text
+
+    try:
+        yield named
+    except JaxmapError as error:
+        raise type(error)(named(error.what, error.fix), where=error.where, fix=error.fix) from error
 
 
 def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, MapTruth]]:
@@ -335,7 +346,8 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
     """
     options, path = config.map_truth, config.ground_truth
     assert path is not None
-    coding = choose_coding(options.remap or (), None, "map_truth.remap")
+    with _naming_options_of("evaluate", "map_truth"):
+        coding = choose_coding(options.remap or (), None, "map_truth.remap")
     named = {*coding.names.values(), *([coding.rest] if coding.rest else [])}
     shown = [index for index, name in enumerate(config.classes) if name in named]
     if len(shown) < 2:
@@ -349,7 +361,8 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
         read_crs(options.crs, "map_truth.crs")
     place, rasters, truths, labels, cells = _place(plan), {}, {}, None, None
     for index in shown:
-        raster = read_label_orthomosaic(path, place, coding=coding, target=config.classes[index], crs=options.crs)
+        with _naming_options_of("evaluate", "map_truth"):
+            raster = read_label_orthomosaic(path, place, coding=coding, target=config.classes[index], crs=options.crs)
         rasters[index] = raster
         truths[index], found, cells = make_map_truth(
             plan.grid, raster, plan.sequence.site_origin, plan.sequence.crs, cell_size_m=options.cell_size_m
@@ -368,10 +381,10 @@ def _place(plan: Plan) -> Extent:
     return Extent(float(low[0]), float(low[1]), float(high[0]), float(high[1]), plan.sequence.crs)
 
 
-def keep_frames(
+def prepare_training_frames(
     plan: Plan, truth: CellTruth, first: SavedModel, anchor: float, notify: Notify
-) -> tuple[KeptFrame, ...]:
-    """All frames that can be used, prepared; the others are told.
+) -> tuple[TrainingFrame, ...]:
+    """Prepares all usable frames; the others are reported.
 
     Raises:
         JaxmapError: they take too much memory.
@@ -385,23 +398,23 @@ def keep_frames(
             fix="take fewer: --mapping.stride, --mapping.stop",
         )
     hidden = [index for index in range(len(plan.labeller.classes)) if index not in truth.rasters]
-    teacher = Segmenter(first) if hidden and anchor > 0 else None
+    network = Segmenter(first) if hidden and anchor > 0 else None
     kept = []
     for prepared in prepare_frames(plan.sequence, plan.front_end, needs="image"):
         if prepared.frame is None or prepared.rectified is None:
             notify(f"skipped: {prepared.fault}")
             continue
         anchors = np.full(prepared.frame.disparity_px.shape, IGNORE, np.uint8)
-        if teacher is not None:
-            said = teacher.logits(prepared.rectified.left).argmax(axis=-1)
-            anchors = np.where(np.isin(said, hidden), said, SHOWN).astype(np.uint8)
+        if network is not None:
+            labels = network.logits(prepared.rectified.left).argmax(axis=-1)
+            anchors = np.where(np.isin(labels, hidden), labels, SHOWN).astype(np.uint8)
         cells = cells_of_pixels(prepared.frame, plan, truth)
-        kept.append(KeptFrame(prepared.ref.name, prepared.frame, anchors, cells))
+        kept.append(TrainingFrame(prepared.ref.name, prepared.frame, anchors, cells))
     return tuple(kept)
 
 
 def cells_of_pixels(frame: Frame, plan: Plan, truth: CellTruth) -> UInt8[np.ndarray, "H W"]:
-    """The class of the cell that each pixel's point lies in; `IGNORE` where there is none."""
+    """The class of the cell that each pixel's point lies in, or `IGNORE`."""
     sigma_px = plan.params.fusion.disparity_sigma_px
     cloud = project(plan.front_end.camera, frame.T_world_camera, frame.disparity_px, plan.depth_range_m, sigma_px)
     points_world = np.asarray(cloud.points_world).reshape(*frame.disparity_px.shape, 3)
@@ -409,9 +422,9 @@ def cells_of_pixels(frame: Frame, plan: Plan, truth: CellTruth) -> UInt8[np.ndar
 
 
 def _split(
-    frames: tuple[KeptFrame, ...], share: float, name: str
-) -> tuple[tuple[KeptFrame, ...], tuple[KeptFrame, ...]]:
-    """The frames that teach and those that validate: the last ones, because neighbours look alike."""
+    frames: tuple[TrainingFrame, ...], share: float, name: str
+) -> tuple[tuple[TrainingFrame, ...], tuple[TrainingFrame, ...]]:
+    """Training frames, and validation frames from the end, because neighbouring frames look alike."""
     held_out = round(len(frames) * share)
     if len(frames) - held_out < 1:
         raise JaxmapError(
@@ -422,11 +435,11 @@ def _split(
     return frames[: len(frames) - held_out], frames[len(frames) - held_out :]
 
 
-def _check_shown(counts: np.ndarray, data: MapData, config: TrainConfig) -> None:
-    """Refuses a ground truth that teaches nothing.
+def _check_shown(counts: np.ndarray, data: MapTrainingData, config: TrainConfig) -> None:
+    """Refuses a ground truth without information.
 
     Raises:
-        JaxmapError: the cells that the frames see are not labelled, or all are of one class.
+        JaxmapError: no cell that the frames see is labelled, or all are of one class.
     """
     shown = [index for index in data.truth.rasters if counts[index]]
     if len(shown) > 1:
@@ -442,7 +455,7 @@ def _check_shown(counts: np.ndarray, data: MapData, config: TrainConfig) -> None
 
 
 def _losses(config: TrainConfig, counts: np.ndarray, shown: Iterable[int]) -> dict[int, MapLossOptions]:
-    """The loss of each class against the rest, from the settings of losses of pixels."""
+    """The loss of each class against the rest, from the options of pixel losses."""
     weights = class_weights(config.loss, counts)
     losses = {}
     for index in shown:
@@ -453,14 +466,3 @@ def _losses(config: TrainConfig, counts: np.ndarray, shown: Iterable[int]) -> di
             class_weight=float(weights[index] / np.mean(others)),
         )
     return losses
-
-
-def _told(data: MapData, counts: np.ndarray) -> str:
-    """One line on frames and truth."""
-    classes, seen = data.plan.labeller.classes, int(counts.sum())
-    pixels = sum(kept.cells.size for kept in data.train)
-    shares = ", ".join(f"{classes[index]} {counts[index] / seen:.1%}" for index in data.truth.rasters)
-    return (
-        f"{len(data.train)} frames to map, {len(data.validation)} to validate; "
-        f"{seen / pixels:.0%} of their pixels lie in labelled cells: {shares}"
-    )

@@ -1,4 +1,4 @@
-"""A training run: steps, validations, checkpoints."""
+"""A training run: its folder, its log, and the loop of steps, validations and checkpoints."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +22,18 @@ from jaxmap.host.output_folder import check_same_settings, write_json, write_yam
 from jaxmap.models.checkpoint import save_model
 from jaxmap.models.deeplab import Weights
 from jaxmap.report.training_page import TrainingRecord, training_page
-from jaxmap.runs.training_plan import TrainingPlan, train_config_tree
+from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainingPlan
 from jaxmap.training.checkpoints import Checkpoints
-from jaxmap.training.step import StepInfo, TrainState
-from jaxmap.training.validation import Shown, Validation
+from jaxmap.training.step import StepMetrics, TrainState
+from jaxmap.training.validation import ValidationExample
+
+REPORT_EVERY_S = 30.0
+"""The page is not rewritten more often, except at the end."""
 
 
 @dataclass
 class TrainingLog:
-    """What a run has done so far; saved with every checkpoint, so that a resumed run goes on counting.
+    """The progress of a run; saved with every checkpoint, so that a resumed run continues it.
 
     Attributes:
         history: one row for each complete epoch.
@@ -38,7 +41,7 @@ class TrainingLog:
         last: the same of the last one.
         seconds: time spent on steps and validations.
         digest: of the training data.
-        complete: whether the run has come to its end.
+        complete: whether the run has ended.
     """
 
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -48,38 +51,39 @@ class TrainingLog:
     digest: str = ""
     complete: bool = False
 
-    def kept(self, keep: str) -> dict[str, Any]:
-        """The validation of the weights that were written; empty where none was."""
-        return self.last if keep == "last" else self.best
+    def metrics(self, plan: TrainingPlan) -> dict[str, Any]:
+        """The contents of metrics.json."""
+        steps = self.history[-1]["step"] if self.history else 0
+        kept = self.last if plan.config.keep == "last" else self.best
+        return {
+            "epochs": len(self.history),
+            "steps": steps,
+            "complete": self.complete,
+            "seconds": round(self.seconds, 1),
+            "examples_seen": steps * plan.config.batch_size,
+            **plan.data.counts(),
+            "fresh": list(plan.network.fresh),
+            "kept_epoch": kept.get("epoch"),
+            "best": self.best,
+            "last": self.last,
+        }
 
-    def history_csv(self) -> str:
-        """The history as text; what an epoch has not is left empty."""
-        columns = list(dict.fromkeys(key for row in self.history for key in row))
-        text = io.StringIO()
-        writer = csv.DictWriter(text, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.history)
-        return text.getvalue()
 
-
-class Meter:
-    """Means over the steps of an epoch."""
+class EpochMeter:
+    """Means over the steps of an epoch, and its time."""
 
     def __init__(self) -> None:
-        self._started_s, self._infos, self._images = time.perf_counter(), [], 0
+        self._started_s, self._steps, self._images = time.perf_counter(), [], 0
         self._lap_s = self._started_s
 
-    def add(self, info: StepInfo, images: int) -> str:
-        """Takes note of a step; returns a line on how it goes."""
-        self._infos.append(info)
+    def add(self, step: StepMetrics, images: int) -> str:
+        """Adds a step; returns a line on the progress."""
+        self._steps.append(step)
         self._images += images
-        rate = self._images / max(self.seconds, 1e-9)
-        return f"loss {float(info.loss):.3f}, accuracy {float(info.accuracy):.1%}, {rate:.1f} images/s"
+        return f"loss {float(step.loss):.3f}, accuracy {float(step.accuracy):.1%}, {self._images_per_s():.1f} images/s"
 
-    @property
-    def seconds(self) -> float:
-        """Since the epoch began."""
-        return time.perf_counter() - self._started_s
+    def _images_per_s(self) -> float:
+        return self._images / max(time.perf_counter() - self._started_s, 1e-9)
 
     def lap_s(self) -> float:
         """Seconds since the last call, or since the epoch began."""
@@ -87,18 +91,18 @@ class Meter:
         return round(self._lap_s - before, 3)
 
     def means(self) -> dict[str, float]:
-        """Of the epoch."""
-        count = max(len(self._infos), 1)
+        """The columns of the history that the steps give."""
+        count = max(len(self._steps), 1)
         return {
-            "learning_rate": float(self._infos[-1].learning_rate) if self._infos else 0.0,
-            "train_loss": sum(float(info.loss) for info in self._infos) / count,
-            "train_accuracy": sum(float(info.accuracy) for info in self._infos) / count,
-            "images_per_s": round(self._images / max(self.seconds, 1e-9), 3),
+            "learning_rate": float(self._steps[-1].learning_rate) if self._steps else 0.0,
+            "train_loss": sum(float(step.loss) for step in self._steps) / count,
+            "train_accuracy": sum(float(step.accuracy) for step in self._steps) / count,
+            "images_per_s": round(self._images_per_s(), 3),
         }
 
 
 class TrainingFolder:
-    """Paths of the folder of one training run.
+    """The folder of a training run, and the files in it.
 
     Args:
         path: the folder.
@@ -114,117 +118,96 @@ class TrainingFolder:
         self.checkpoints = path / "checkpoints"
 
     def begin(self, plan: TrainingPlan, *, resume: bool, overwrite: bool) -> None:
-        """Writes the resolved settings, or checks that a run can go on.
+        """Writes the resolved settings, or checks that a run can be resumed.
 
         Raises:
-            JaxmapError: the folder holds a run already, or other files of the same names.
+            JaxmapError: the folder already holds a run, or other files of the same names.
             UsageError: the run to be resumed had other settings.
         """
         tree = {
             "training_data": plan.data.source,
             "init": None if plan.init is None else str(plan.init.resolve()),
-            **train_config_tree(plan.config),
+            **TRAIN_SETTINGS.tree(plan.config),
         }
         outputs = (self.model, self.history, self.metrics, self.report, self.config)
         there = [path.name for path in (*outputs, self.checkpoints) if path.exists()]
-        if there and not self._begun():
-            raise JaxmapError(
-                f"{', '.join(there)} would be replaced, but no training has written them",
-                where=self.path,
-                fix="choose another --out",
-            )
+        if there and not self._is_of_training():
+            what = f"{', '.join(there)} would be replaced, but no training has written them"
+            raise JaxmapError(what, where=self.path, fix="choose another --out")
         if resume and self.checkpoints.is_dir():
             check_same_settings(self.config, tree)
             return
-        worth_keeping = (self.model, self.history, self.checkpoints)
-        if not overwrite and any(path.exists() for path in worth_keeping):
-            what, fix = "the folder holds a training run already", "go on with it (--resume), "
+        if not overwrite and any(path.exists() for path in (self.model, self.history, self.checkpoints)):
+            what, fix = "the folder holds a training run already", "resume it (--resume), "
             if resume:
                 what, fix = "the training run in the folder has lost its checkpoints", ""
             fix += "replace it (--overwrite), or choose another folder"
             raise JaxmapError(what, where=self.path, fix=fix)
-        inputs = {path.resolve() for path in (plan.init,) if path is not None}
         for path in outputs:
-            if path.resolve() in inputs:
+            if plan.init is not None and path.resolve() == plan.init.resolve():
                 raise JaxmapError("an input would be overwritten", where=path, fix="choose another --out")
             path.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
         write_yaml(self.config, tree)
 
-    def _begun(self) -> bool:
-        """Whether it was a training run that wrote the settings here."""
+    def _is_of_training(self) -> bool:
         try:
             return self.config.read_text(encoding="utf8").startswith("training_data:")
         except (OSError, UnicodeDecodeError):
             return False
 
     def write_history(self, log: TrainingLog) -> None:
-        """Writes history.csv."""
+        """Writes history.csv; cells without a value are left empty."""
+        columns = list(dict.fromkeys(key for row in log.history for key in row))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(log.history)
         with atomic_path(self.history) as temporary:
-            temporary.write_text(log.history_csv(), encoding="utf8")
+            temporary.write_text(text.getvalue(), encoding="utf8")
 
-    def write_report(self, plan: TrainingPlan, log: TrainingLog, shown: Sequence[Shown], status: str) -> None:
+    def write_report(
+        self, plan: TrainingPlan, log: TrainingLog, examples: Sequence[ValidationExample], status: str
+    ) -> None:
         """Writes report.html and metrics.json; `status` says why the run has stopped, if it has."""
-        record = TrainingRecord(
-            title=plan.data.title,
-            classes=plan.start.architecture.classes,
-            history=log.history,
-            summary={name: scores for name, scores in (("best", log.best), ("last", log.last)) if scores},
-            facts=_facts(plan),
-            overlays=[(example.name, example.image, example.truth, example.prediction) for example in shown],
-            status=status,
+        config, network = plan.config, plan.network
+        crop_px, scale, optimiser = config.augmentation.crop_px, config.augmentation.scale, config.optimiser
+        record, fixed = network.architecture, plan.order.variants > 1
+        facts = {
+            **plan.data.facts(),
+            "Examples": f"{plan.order.examples} fixed ones" if fixed else "drawn anew in each epoch",
+            "Network": f"DeepLabv3{'+' * record.decoder}, {record.backbone}, output stride {record.output_stride}",
+            "Initial weights": "random" if plan.init is None else plan.init.name,
+            "Random parts": ", ".join(network.fresh) or "none",
+            "Batch norm trained in": ", ".join(network.batch_norms) or "no part",
+            "Crops": f"{crop_px[0]} x {crop_px[1]} px at {scale[0]:g} to {scale[1]:g} of the image's scale",
+            "Optimiser": f"{optimiser.kind}, learning rate {optimiser.learning_rate:g}, poly {optimiser.power:g}",
+            "Batch": f"{config.batch_size} on {jax.local_device_count()} {jax.default_backend().upper()} device(s)",
+        }
+        page = training_page(
+            TrainingRecord(
+                title=plan.data.title,
+                classes=record.classes,
+                history=log.history,
+                summary={name: scores for name, scores in (("best", log.best), ("last", log.last)) if scores},
+                facts=facts,
+                examples=examples,
+                status=status,
+            )
         )
         with atomic_path(self.report) as temporary:
-            temporary.write_text(training_page(record), encoding="utf8")
-        write_json(self.metrics, metrics_of(plan, log))
-
-
-def _facts(plan: TrainingPlan) -> dict[str, str]:
-    config, record = plan.config, plan.start.architecture
-    fixed = f"{plan.order.examples} fixed ones" if plan.order.variants > 1 else "drawn anew each time"
-    size, scale, optimiser = config.augmentation.crop_px, config.augmentation.scale, config.optimiser
-    return {
-        **plan.data.facts(),
-        "Examples": fixed,
-        "Network": f"DeepLabv3{'+' * record.decoder}, {record.backbone}, output stride {record.output_stride}",
-        "Started from": "random weights" if plan.init is None else plan.init.name,
-        "Fresh weights": ", ".join(plan.start.fresh) or "none",
-        "Batch norm learns in": ", ".join(plan.start.batch_norms) or "no block",
-        "Crops": f"{size[0]} x {size[1]} px at {scale[0]:g} to {scale[1]:g} of the image's scale",
-        "Optimiser": f"{optimiser.kind}, learning rate {optimiser.learning_rate:g}, poly {optimiser.power:g}",
-        "Batch": f"{config.batch_size} on {jax.local_device_count()} {jax.default_backend().upper()} device(s)",
-    }
-
-
-def metrics_of(plan: TrainingPlan, log: TrainingLog) -> dict[str, Any]:
-    """What metrics.json holds."""
-    steps = log.history[-1]["step"] if log.history else 0
-    return {
-        "epochs": len(log.history),
-        "steps": steps,
-        "complete": log.complete,
-        "seconds": round(log.seconds, 1),
-        "examples_seen": steps * plan.config.batch_size,
-        **plan.data.counts(),
-        "fresh": list(plan.start.fresh),
-        "kept_epoch": log.kept(plan.config.keep).get("epoch"),
-        "best": log.best,
-        "last": log.last,
-    }
-
-
-REPORT_EVERY_S = 30.0
-"""The page is rewritten no more often, but at the end."""
+            temporary.write_text(page, encoding="utf8")
+        write_json(self.metrics, log.metrics(plan))
 
 
 class TrainingRun:
-    """Goes through the steps of a plan and keeps its folder up to date.
+    """Trains as planned, and keeps the folder up to date.
 
     Args:
-        plan: the run.
+        plan: of the run.
         folder: where it is written.
         notify: takes lines for the user.
-        on_step: is called with the steps taken and a line on how it goes.
+        on_step: is called with the number of steps done and a line on the progress.
     """
 
     def __init__(
@@ -237,70 +220,61 @@ class TrainingRun:
     ) -> None:
         self._plan, self._folder, self._notify, self._on_step = plan, folder, notify, on_step
         self._checkpoints = Checkpoints(folder.checkpoints)
-        self._validator = plan.data.validator(plan.start.architecture)
+        self._validator = plan.data.validator(plan.network.architecture)
         self._log = TrainingLog(digest=plan.data.digest())
-        self._shown: tuple[Shown, ...] = ()
+        self._examples: tuple[ValidationExample, ...] = ()
         self._reported_s = 0.0
-        self._status = ""
 
     def run(self) -> dict[str, Any]:
-        """Trains to the end, and returns what it writes into metrics.json.
+        """Trains to the end, and returns the contents of metrics.json.
 
         Raises:
-            JaxmapError: the loss is no longer finite, the data or the checkpoints cannot be read, or writing
-                failed. The model and the checkpoints written so far stay.
+            JaxmapError: the loss is no longer finite, data or checkpoints cannot be read, or writing failed. The
+                model and the checkpoints written so far stay.
         """
         plan = self._plan
-        share = _Sharing()
-        state = self._restored(plan.trainer.init(plan.start.weights))
-        state = jax.device_put(state, share.replicated)
+        mesh = Mesh(jax.local_devices(), ("data",))
+        replicated, split = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("data"))
+        state = jax.device_put(self._restored(plan.trainer.init(plan.network.weights)), replicated)
         if self._log.complete:
             self._notify("the run is complete; nothing is left to do")
-            return metrics_of(self._plan, self._log)
-        key = jax.device_put(jax.random.key(plan.config.seed), share.replicated)
-        epoch = len(self._log.history)
-        meter, first_step = Meter(), int(state.step)
+            return self._log.metrics(plan)
+        key = jax.device_put(jax.random.key(plan.config.seed), replicated)
+        epoch, first_step, meter = len(self._log.history), int(state.step), EpochMeter()
         try:
             for step, batch in enumerate(plan.data.batches(plan.order, first_step), first_step):
-                state, info = plan.trainer.step(state, jax.device_put(batch, share.split), key)
-                self._check_finite(info, step, epoch)
-                self._on_step(step + 1, meter.add(info, plan.config.batch_size))
+                state, metrics = plan.trainer.step(state, jax.device_put(batch, split), key)
+                if not bool(metrics.finite):
+                    raise self._not_finite(metrics, step, epoch)
+                self._on_step(step + 1, meter.add(metrics, plan.config.batch_size))
                 if step + 1 < plan.order.epoch_end(epoch):
                     continue
-                # A batch of more examples than there are ends several epochs.
+                # A batch that is larger than an epoch ends several of them.
                 while epoch < plan.config.epochs and step + 1 >= plan.order.epoch_end(epoch):
                     self._end_epoch(epoch, state, meter)
                     epoch += 1
-                self._keep(state)
-                meter = Meter()
+                self._save(state)
+                meter = EpochMeter()
         except JaxmapError as error:
-            self._stop(f"Stopped: {error.what}.")
+            self._report_stop(f"Stopped: {error.what}.")
             raise
         except KeyboardInterrupt:
             place = f"epoch {min(epoch + 1, plan.config.epochs)} of {plan.config.epochs}"
-            self._stop(f"Interrupted in {place}.")
+            self._report_stop(f"Interrupted in {place}.")
             self._notify(f"interrupted in {place}, which --resume begins again")
             raise
-        return metrics_of(self._plan, self._log)
-
-    def _stop(self, status: str) -> None:
-        self._status = status
-        # What stopped the run is told, and not that the page could not be written either.
-        with suppress(JaxmapError):
-            self._write_report()
+        return self._log.metrics(plan)
 
     def _restored(self, state: TrainState) -> TrainState:
+        """The state of the newest checkpoint, and the log with it; `state` where there is none."""
         saved = self._checkpoints.restore(state)
         if saved is None:
             return state
         try:
             log = TrainingLog(**saved.record)
         except TypeError as error:
-            raise JaxmapError(
-                "the checkpoints were written by another version of jaxmap",
-                where=self._folder.checkpoints,
-                fix="start anew with --overwrite",
-            ) from error
+            what = "the checkpoints were written by another version of jaxmap"
+            raise JaxmapError(what, where=self._folder.checkpoints, fix="start anew with --overwrite") from error
         if log.digest != self._log.digest:
             raise JaxmapError(
                 "the training data have changed since the run was begun",
@@ -308,85 +282,64 @@ class TrainingRun:
                 fix="restore them, or start anew with --overwrite",
             )
         self._log = log
-        self._notify(f"going on after epoch {len(log.history)} of {self._plan.config.epochs}")
+        self._notify(f"resuming after epoch {len(log.history)} of {self._plan.config.epochs}")
         return saved.state
 
-    def _check_finite(self, info: StepInfo, step: int, epoch: int) -> None:
-        if bool(info.finite):
-            return
+    def _not_finite(self, metrics: StepMetrics, step: int, epoch: int) -> JaxmapError:
         order = self._plan.order
         images = [self._plan.data.names[int(place) // order.variants] for place in order.draws(step)[:, 1]]
-        loss, norm = float(info.loss), float(info.gradient_norm)
-        numbers = f"loss {loss:g}, gradient norm {norm:g}"
-        raise JaxmapError(
-            f"{'new weights that are not finite' if math.isfinite(loss + norm) else numbers} in step {step + 1}, "
-            f"epoch {epoch + 1}, with the images {', '.join(dict.fromkeys(images))}; what was kept before is there",
+        loss, norm = float(metrics.loss), float(metrics.gradient_norm)
+        what = f"loss {loss:g}, gradient norm {norm:g}"
+        if math.isfinite(loss + norm):
+            what = "new weights that are not finite"
+        return JaxmapError(
+            f"{what} in step {step + 1}, epoch {epoch + 1}, with the images {', '.join(dict.fromkeys(images))}; "
+            "earlier checkpoints are kept",
             where=self._folder.path,
             fix="look at these images, or take a lower optimiser.learning-rate and start anew from the model",
         )
 
-    def _end_epoch(self, epoch: int, state: TrainState, meter: Meter) -> None:
+    def _end_epoch(self, epoch: int, state: TrainState, meter: EpochMeter) -> None:
+        """Validates where it is due, and adds the row of the epoch to the history."""
         config, last = self._plan.config, epoch + 1 == self._plan.config.epochs
         weights = state.average or state.weights
         row: dict[str, Any] = {"epoch": epoch + 1, "step": int(state.step), **meter.means()}
         if self._validator is not None and ((epoch + 1) % config.validate_every == 0 or last):
             row |= self._validate(epoch, weights)
         elif self._validator is None and last:
-            self._save_model(weights)
+            save_model(self._folder.model, self._plan.network.architecture, weights)
         row["seconds"] = meter.lap_s()
         self._log.history.append(row)
         self._log.seconds += row["seconds"]
         self._log.complete = last
 
-    def _keep(self, state: TrainState) -> None:
-        """Writes everything; the checkpoint last, so that what a resumed run need not do again is there."""
-        self._folder.write_history(self._log)
-        if self._log.complete or time.monotonic() - self._reported_s > REPORT_EVERY_S:
-            self._write_report()
-        self._checkpoints.save(state, dict(vars(self._log)))
-
     def _validate(self, epoch: int, weights: Weights) -> dict[str, Any]:
+        """Validates, writes the model if it is to be kept, and returns the columns of the history."""
         assert self._validator is not None
-        validation = self._validator.score(weights)
-        self._shown = validation.shown
-        self._log.last = {"epoch": epoch + 1, **validation.summary}
-        iou = validation.summary["mean_iou"]
+        summary, loss, self._examples = self._validator.score(weights)
+        self._log.last = {"epoch": epoch + 1, **summary}
         # Where nothing can be scored, the last weights are as good as any.
-        better = not self._log.best or iou is None or iou > self._log.best["mean_iou"]
+        mean_iou = summary["mean_iou"]
+        better = not self._log.best or mean_iou is None or mean_iou > self._log.best["mean_iou"]
         if better:
             self._log.best = self._log.last
         if better or self._plan.config.keep == "last":
-            self._save_model(weights)
-        self._notify(_told(epoch + 1, validation))
-        ious = {f"iou_{name}": values["iou"] for name, values in validation.summary["classes"].items()}
-        return {
-            "val_loss": validation.loss,
-            "mean_iou": validation.summary["mean_iou"],
-            "accuracy": validation.summary["accuracy"],
-            **ious,
-        }
+            save_model(self._folder.model, self._plan.network.architecture, weights)
+        ious = {name: scores["iou"] for name, scores in summary["classes"].items()}
+        listed = ", ".join(f"{name} {iou:.3f}" for name, iou in ious.items() if iou is not None)
+        self._notify(f"epoch {epoch + 1}: validation loss {loss or 0:.3f}, IoU: {listed}")
+        columns = {"val_loss": loss, "mean_iou": mean_iou, "accuracy": summary["accuracy"]}
+        return columns | {f"iou_{name}": iou for name, iou in ious.items()}
 
-    def _save_model(self, weights: Weights) -> None:
-        save_model(self._folder.model, self._plan.start.architecture, weights)
+    def _save(self, state: TrainState) -> None:
+        """Writes everything; the checkpoint last, so that a resumed run finds all that precedes it."""
+        self._folder.write_history(self._log)
+        if self._log.complete or time.monotonic() - self._reported_s > REPORT_EVERY_S:
+            self._folder.write_report(self._plan, self._log, self._examples, "")
+            self._reported_s = time.monotonic()
+        self._checkpoints.save(state, asdict(self._log))
 
-    def _write_report(self) -> None:
-        self._folder.write_report(self._plan, self._log, self._shown, self._status)
-        self._reported_s = time.monotonic()
-
-
-class _Sharing:
-    """Where arrays lie when all devices share a batch."""
-
-    def __init__(self) -> None:
-        mesh = Mesh(jax.local_devices(), ("data",))
-        self.replicated = NamedSharding(mesh, PartitionSpec())
-        self.split = NamedSharding(mesh, PartitionSpec("data"))
-
-
-def _told(epoch: int, validation: Validation) -> str:
-    ious = ", ".join(
-        f"{name} {values['iou']:.3f}"
-        for name, values in validation.summary["classes"].items()
-        if values["iou"] is not None
-    )
-    return f"epoch {epoch}: validation loss {validation.loss or 0:.3f}, IoU: {ious}"
+    def _report_stop(self, status: str) -> None:
+        # If the page cannot be written either, the error that stopped the run is the one to report.
+        with suppress(JaxmapError):
+            self._folder.write_report(self._plan, self._log, self._examples, status)

@@ -1,7 +1,7 @@
-"""Augmentation: scaled, mirrored crops of images and masks, and changes of light, in one compiled function.
+"""Augmentation: scaled, mirrored crops of images and masks, and photometric changes, in one compiled function.
 
-A crop is drawn as a `View`, which says for every pixel of the crop where in the image it lies. Colours are
-interpolated there; labels are those of the nearest pixel, so that no label comes out which was not there.
+A crop is drawn as a `CropWindow`, which maps every pixel of the crop to a place on the image. Colours are interpolated
+bilinearly; labels are those of the nearest pixel, so that no new label arises.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from jaxmap.training.options import AugmentationOptions
 _LUMA = (0.299, 0.587, 0.114)
 
 
-class View(NamedTuple):
+class CropWindow(NamedTuple):
     """Where a crop lies on its image.
 
     Attributes:
-        scale: crop pixels for each image pixel.
+        scale: crop pixels per image pixel.
         offset_px: (row, column) of the crop's first pixel on the scaled image; negative where the crop
             begins outside it.
-        mirrored: whether left and right are exchanged.
+        mirrored: whether the image is mirrored, left to right, before it is cropped.
     """
 
     scale: Float[Array, ""]
@@ -33,14 +33,13 @@ class View(NamedTuple):
     mirrored: Bool[Array, ""]
 
 
-def draw_view(
+def draw_window(
     key: PRNGKeyArray, labels: UInt8[Array, "H W"], size_px: Int[Array, "2"], options: AugmentationOptions
-) -> View:
-    """A random crop of an image of `size_px` (height, width).
+) -> CropWindow:
+    """Draws a crop of an image of `size_px` (height, width).
 
-    Where the scaled image is smaller than the crop, it lies somewhere within it. `options.class_share` of the crops are
-    drawn so that a pixel of a class lies somewhere in them, each class of the image as often as the others: large
-    crops show little of what is rare.
+    Where the scaled image is smaller than the crop, it lies somewhere within it. `options.class_share` of the crops
+    hold a random pixel of a random class of the image: in large crops drawn evenly, rare classes would be rare.
     """
     scale_key, offset_key, mirror_key = jax.random.split(key, 3)
     scale = jax.random.uniform(scale_key, minval=options.scale[0], maxval=options.scale[1])
@@ -56,16 +55,13 @@ def draw_view(
         place = jax.random.randint(place_key, (2,), 0, crop_px)
         around = jnp.clip(jnp.floor((pixel + 0.5) * scale).astype(jnp.int32) - place, low, high)
         offset_px = jnp.where(jax.random.bernoulli(chosen_key, options.class_share), around, offset_px)
-    return View(scale, offset_px, mirrored)
+    return CropWindow(scale, offset_px, mirrored)
 
 
 def draw_pixel(
     key: PRNGKeyArray, labels: UInt8[Array, "H W"], size_px: Int[Array, "2"]
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Row and column of a random pixel of a random class, of those that an image of `size_px` holds.
-
-    (0, 0) where it holds none.
-    """
+    """Row and column of a random pixel of a random class among those of an image of `size_px`; (0, 0) without any."""
     class_key, row_key, column_key = jax.random.split(key, 3)
     rows, columns = (jnp.arange(count) for count in labels.shape)
     labels = jnp.where((rows < size_px[0])[:, None] & (columns < size_px[1]), labels, IGNORE)
@@ -78,54 +74,54 @@ def draw_pixel(
 
 
 def _draw_place(key: PRNGKeyArray, counts: Int[Array, "N"] | Bool[Array, "N"]) -> Int[Array, ""]:
-    """A place, each as likely as its count tells."""
+    """An index, with a probability proportional to its count."""
     reached = jnp.cumsum(counts.astype(jnp.int32))
     drawn = jax.random.randint(key, (), 0, jnp.maximum(reached[-1], 1))
     return jnp.searchsorted(reached, drawn, side="right").astype(jnp.int32)
 
 
-def whole_view(size_px: Int[Array, "2"], crop_px: tuple[int, int]) -> View:
-    """The whole image, as large as it fits into the crop, in its middle."""
+def whole_window(size_px: Int[Array, "2"], crop_px: tuple[int, int]) -> CropWindow:
+    """The whole image in the middle of the crop, as large as fits."""
     scale = (jnp.array(crop_px) / size_px).min()
     spare_px = jnp.round(size_px * scale).astype(jnp.int32) - jnp.array(crop_px)
-    return View(scale, spare_px // 2, jnp.zeros((), bool))
+    return CropWindow(scale, spare_px // 2, jnp.zeros((), bool))
 
 
 def cut(
-    view: View,
+    window: CropWindow,
     image: UInt8[Array, "H W 3"],
     labels: UInt8[Array, "H W"],
     size_px: Int[Array, "2"],
     crop_px: tuple[int, int],
     fill: tuple[float, ...],
 ) -> tuple[Float[Array, "h w 3"], UInt8[Array, "h w"]]:
-    """Cuts a view out of an image and its labels.
+    """Cuts a window out of an image and its labels.
 
     Args:
-        view: what is cut.
-        image: RGB, 0 to 255; may be padded below and to the right.
+        window: where the crop lies.
+        image: RGB, 0 to 255; may be padded at the bottom and on the right.
         labels: of the same pixels.
         size_px: height and width of the image without the padding.
         crop_px: height and width of the crop.
-        fill: colour of what lies outside the image; its label is `IGNORE`.
+        fill: colour of pixels outside the image; their label is `IGNORE`.
 
     Returns:
         The crop, 0 to 255, and its labels.
     """
-    rows, columns = (_positions(view, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
+    rows, columns = (_positions(window, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
     inside = rows.inside[:, None] & columns.inside[None, :]
     values = image.astype(jnp.float32)
     values = _between(values[rows.low], values[rows.high], rows.share[:, None, None])
     values = _between(values[:, columns.low], values[:, columns.high], columns.share[None, :, None])
-    near = cut_nearest(view, labels, size_px, crop_px, IGNORE)
+    near = cut_nearest(window, labels, size_px, crop_px, IGNORE)
     return jnp.where(inside[..., None], values, jnp.array(fill)), near
 
 
 def cut_nearest(
-    view: View, values: Shaped[Array, "H W"], size_px: Int[Array, "2"], crop_px: tuple[int, int], outside: float
+    window: CropWindow, values: Shaped[Array, "H W"], size_px: Int[Array, "2"], crop_px: tuple[int, int], outside: float
 ) -> Shaped[Array, "h w"]:
-    """Cuts a view out of numbers that cannot be interpolated; `outside` is what lies outside the image."""
-    rows, columns = (_positions(view, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
+    """Cuts a window out of values that cannot be interpolated; pixels outside the image are `outside`."""
+    rows, columns = (_positions(window, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
     inside = rows.inside[:, None] & columns.inside[None, :]
     return jnp.where(inside, values[rows.nearest][:, columns.nearest], outside).astype(values.dtype)
 
@@ -140,10 +136,10 @@ class _Positions(NamedTuple):
     inside: Array
 
 
-def _positions(view: View, axis: int, size: Array, count: int) -> _Positions:
-    exact = (jnp.arange(count) + view.offset_px[axis] + 0.5) / view.scale - 0.5
+def _positions(window: CropWindow, axis: int, size: Array, count: int) -> _Positions:
+    exact = (jnp.arange(count) + window.offset_px[axis] + 0.5) / window.scale - 0.5
     if axis == 1:
-        exact = jnp.where(view.mirrored, size - 1 - exact, exact)
+        exact = jnp.where(window.mirrored, size - 1 - exact, exact)
     nearest = jnp.floor(exact + 0.5).astype(jnp.int32)
     inside = (nearest >= 0) & (nearest < size)
     exact = jnp.clip(exact, 0, size - 1)
@@ -158,9 +154,9 @@ def _between(before: Array, after: Array, share: Array) -> Array:
 def change_light(
     key: PRNGKeyArray, image: Float[Array, "h w 3"], options: AugmentationOptions
 ) -> Float[Array, "h w 3"]:
-    """Brightness, contrast, saturation, gamma, hue and noise, each drawn within its option; 0 leaves it alone.
+    """Changes brightness, contrast, saturation, gamma, hue and noise, each drawn within its option.
 
-    Changes that are off cost nothing: what is drawn depends on the options alone.
+    A change whose option is 0 is not compiled in.
     """
     keys = jax.random.split(key, 6)
 
@@ -169,7 +165,7 @@ def change_light(
 
     red, green, blue = (image[..., channel] for channel in range(3))
     if options.hue_rad:
-        red, green, blue = _turned(jax.random.uniform(keys[0], minval=-1.0) * options.hue_rad, red, green, blue)
+        red, green, blue = _rotated(jax.random.uniform(keys[0], minval=-1.0) * options.hue_rad, red, green, blue)
     if options.saturation:
         amount, grey = factor(1, options.saturation), _luma(red, green, blue)
         red, green, blue = (_between(grey, channel, amount) for channel in (red, green, blue))
@@ -191,8 +187,8 @@ def _luma(red: Array, green: Array, blue: Array) -> Array:
     return _LUMA[0] * red + _LUMA[1] * green + _LUMA[2] * blue
 
 
-def _turned(angle_rad: Array, red: Array, green: Array, blue: Array) -> tuple[Array, Array, Array]:
-    """Colours turned around the grey axis, which keeps greys as they are (Rodrigues' formula)."""
+def _rotated(angle_rad: Array, red: Array, green: Array, blue: Array) -> tuple[Array, Array, Array]:
+    """Colours rotated around the grey axis, which leaves greys unchanged (Rodrigues' formula)."""
     cosine, sine = jnp.cos(angle_rad), jnp.sin(angle_rad) / jnp.sqrt(3.0)
     grey = (red + green + blue) * ((1 - cosine) / 3)
     return (
@@ -211,21 +207,25 @@ def augment(
     options: AugmentationOptions,
     fill: tuple[float, ...],
 ) -> tuple[Float[Array, "h w 3"], UInt8[Array, "h w"]]:
-    """One training example out of one image: a random crop in random light, or the whole image where `original`."""
-    view_key, light_key = jax.random.split(key)
-    drawn = draw_view(view_key, labels, size_px, options)
-    view = jax.tree.map(
-        lambda whole, part: jnp.where(original, whole, part), whole_view(size_px, options.crop_px), drawn
+    """One training example: a random crop with photometric changes, or the whole image where `original`."""
+    window_key, light_key = jax.random.split(key)
+    drawn = draw_window(window_key, labels, size_px, options)
+    window = jax.tree.map(
+        lambda whole, part: jnp.where(original, whole, part), whole_window(size_px, options.crop_px), drawn
     )
-    crop, near = cut(view, image, labels, size_px, options.crop_px, fill)
-    lit = change_light_inside(light_key, view, crop, size_px, options)
+    crop, near = cut(window, image, labels, size_px, options.crop_px, fill)
+    lit = change_light_inside(light_key, window, crop, size_px, options)
     return jnp.where(original, crop, lit), near
 
 
 def change_light_inside(
-    key: PRNGKeyArray, view: View, crop: Float[Array, "h w 3"], size_px: Int[Array, "2"], options: AugmentationOptions
+    key: PRNGKeyArray,
+    window: CropWindow,
+    crop: Float[Array, "h w 3"],
+    size_px: Int[Array, "2"],
+    options: AugmentationOptions,
 ) -> Float[Array, "h w 3"]:
-    """`change_light`, but the colour outside the image stays the fill."""
-    rows, columns = (_positions(view, axis, size_px[axis], options.crop_px[axis]).inside for axis in (0, 1))
+    """`change_light` of the pixels inside the image; the others keep the fill colour."""
+    rows, columns = (_positions(window, axis, size_px[axis], options.crop_px[axis]).inside for axis in (0, 1))
     outside = ~(rows[:, None] & columns[None, :])
     return jnp.where(outside[..., None], crop, change_light(key, crop, options))

@@ -1,4 +1,4 @@
-"""Which examples make which batch, and their pixels, read ahead in threads."""
+"""The order of examples, and the batches made of them, read ahead in threads."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ CACHE_BYTES = 2 * 2**30
 BATCHES_AHEAD = 3
 
 
-class Order(NamedTuple):
-    """The order in which a run sees its examples; any step can be asked for, so that a run can go on anywhere.
+class ExampleOrder(NamedTuple):
+    """The order of the examples of a run; that of any step can be computed, so that a run can resume anywhere.
 
     Epochs follow each other without a gap: a batch may end one and begin the next, and every example is
     seen equally often.
 
     Attributes:
-        images: how many there are.
-        variants: examples made of each: 1, or 1 + copies where they are fixed.
+        images: their number.
+        variants: examples made of each image: 1, or 1 + copies where they are fixed.
         options: the recipe.
     """
 
@@ -37,8 +37,8 @@ class Order(NamedTuple):
     options: TrainingOptions
 
     @classmethod
-    def of(cls, images: int, options: TrainingOptions) -> Order:
-        """The order of a recipe over so many images."""
+    def of(cls, images: int, options: TrainingOptions) -> ExampleOrder:
+        """The order of a recipe for a number of images."""
         return cls(images, 1 + (options.augmentation.copies or 0), options)
 
     @property
@@ -56,20 +56,20 @@ class Order(NamedTuple):
         return -(-(epoch + 1) * self.examples // self.options.batch_size)
 
     def draws(self, step: int) -> Int[np.ndarray, "B 2"]:
-        """(epoch, example) of each place of a step's batch."""
+        """(epoch, example) of each item of a step's batch."""
         size = self.options.batch_size
         places = np.arange(step * size, (step + 1) * size)
         epochs, within = np.divmod(places, self.examples)
-        orders = {epoch: self._permutation(epoch) for epoch in np.unique(epochs).tolist()}
+        orders = {
+            epoch: np.random.default_rng((self.options.seed, epoch)).permutation(self.examples)
+            for epoch in np.unique(epochs).tolist()
+        }
         chosen = [orders[epoch][place] for epoch, place in zip(epochs.tolist(), within.tolist(), strict=True)]
         return np.stack([epochs, chosen], axis=1).astype(np.int32)
 
-    def _permutation(self, epoch: int) -> Int[np.ndarray, "N"]:
-        return np.random.default_rng((self.options.seed, epoch)).permutation(self.examples)
 
-
-class Pixels:
-    """Reads examples, and keeps as many as fit into memory."""
+class ExampleReader:
+    """Reads examples and makes batches of them; as many as fit into `cache_bytes` stay in memory."""
 
     def __init__(self, examples: Sequence[Example], lookup: MaskLookup, cache_bytes: int = CACHE_BYTES) -> None:
         self._examples, self._lookup = examples, lookup
@@ -94,7 +94,7 @@ class Pixels:
                 self._kept[index], self._room = pair, self._room - taken
         return pair
 
-    def batch(self, draws: Int[np.ndarray, "B 2"], order: Order) -> Batch:
+    def batch(self, draws: Int[np.ndarray, "B 2"], order: ExampleOrder) -> Batch:
         """The batch of these draws.
 
         Raises:
@@ -115,8 +115,8 @@ class Pixels:
         return Batch(images, labels, sizes, seeds, originals)  # type: ignore[arg-type]
 
 
-def batches_from(pixels: Pixels, order: Order, first_step: int) -> Iterator[Batch]:
-    """The batches of a run from a step on, read ahead.
+def batches_from(pixels: ExampleReader, order: ExampleOrder, first_step: int) -> Iterator[Batch]:
+    """The batches of a run from `first_step` on, read ahead.
 
     Raises:
         JaxmapError: an image cannot be read.

@@ -1,9 +1,8 @@
-"""Checkpoints of a training run: everything that is needed to go on exactly, kept by orbax."""
+"""Checkpoints of a training run, kept by orbax: all that is needed to resume it exactly."""
 
 from __future__ import annotations
 
 import logging
-import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,24 +15,24 @@ from jaxmap.training.step import TrainState
 KEPT = 2
 
 
-class Saved(NamedTuple):
-    """What a checkpoint holds: the state, and plain values beside it."""
+class SavedState(NamedTuple):
+    """The contents of a checkpoint: the state, and plain values beside it."""
 
     state: TrainState
     record: dict[str, Any]
 
 
 class Checkpoints:
-    """The checkpoints in a folder; the newest few are kept, each complete or not there.
+    """The checkpoints in a folder; the newest few are kept, each written whole or not at all.
 
     Args:
-        folder: where they lie; made with the first.
+        folder: of the checkpoints; made with the first.
     """
 
     def __init__(self, folder: Path) -> None:
         import orbax.checkpoint as orbax
 
-        # Orbax tells its own progress at length.
+        # Orbax logs its own progress at length.
         logging.getLogger("absl").setLevel(logging.ERROR)
         self._folder, self._orbax = folder, orbax
         self._manager: Any = None
@@ -55,7 +54,7 @@ class Checkpoints:
         step, arguments = int(state.step), self._orbax.args
         try:
             if step in self._open().all_steps():
-                # A damaged one of the same step, which the run has gone on before.
+                # A damaged one of the same step, before which the run was resumed.
                 self._open().delete(step)
             self._open().save(
                 step,
@@ -73,7 +72,7 @@ class Checkpoints:
                 fix="check the disk, then --resume",
             ) from error
 
-    def restore(self, like: TrainState) -> Saved | None:
+    def restore(self, like: TrainState) -> SavedState | None:
         """The newest checkpoint that can be read, or None where there is none at all.
 
         Args:
@@ -99,19 +98,14 @@ class Checkpoints:
             fix="start anew with --overwrite",
         ) from fault
 
-    def _read(self, step: int, like: TrainState) -> Saved:
+    def _read(self, step: int, like: TrainState) -> SavedState:
         arguments = self._orbax.args
         abstract = jax.tree.map(self._orbax.utils.to_shape_dtype_struct, _tree(like))
         found = self._open().restore(
             step,
             args=arguments.Composite(state=arguments.StandardRestore(abstract), record=arguments.JsonRestore()),
         )
-        return Saved(TrainState(**found["state"]), found["record"])
-
-    def clear(self) -> None:
-        """Removes all checkpoints."""
-        self._manager = None
-        shutil.rmtree(self._folder, ignore_errors=True)
+        return SavedState(TrainState(**found["state"]), found["record"])
 
 
 def _tree(state: TrainState) -> dict[str, Any]:

@@ -1,11 +1,13 @@
-"""Training data: a folder of images and masks, checked whole before the long work starts."""
+"""Training data: a folder of images and masks, its split, and a check of all files before training begins."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -17,7 +19,6 @@ from jaxmap.errors import JaxmapError
 from jaxmap.models.tensor_files import shortened
 from jaxmap.training.masks import (
     UNNAMED,
-    Colour,
     MaskLookup,
     absent_classes,
     make_mask_lookup,
@@ -25,19 +26,22 @@ from jaxmap.training.masks import (
     read_labels,
     unnamed_codes,
 )
-from jaxmap.training.splits import Files, find_files, split_names
+from jaxmap.training.options import DataOptions
 
 MASK_SUFFIXES = (".png",)
+TRAIN_LIST, VALIDATION_LIST = "train.txt", "val.txt"
 MAX_THREADS = 8
 
 Pixels = UInt8[np.ndarray, "H W 3"]
 Labels = UInt8[np.ndarray, "H W"]
+Files = Mapping[str, Sequence[Path]]
+"""The files of each name; in a correct folder, one for each."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 class Example(NamedTuple):
-    """An image and its mask, not read yet.
+    """An image and its mask, as files.
 
     Attributes:
         name: path of the image below `images/`, without suffix.
@@ -53,15 +57,15 @@ class Example(NamedTuple):
 
 
 class TrainingSet(NamedTuple):
-    """What a network is trained on.
+    """The examples that a network is trained and validated on.
 
     Attributes:
-        folder: where it lies.
+        folder: of images and masks.
         classes: names in the order of the labels.
-        train: examples in order of name.
-        validation: those that only score; may be none.
-        lookup: what the pixels of the masks stand for.
-        notes: what should be known about how the examples were chosen.
+        train: training examples, in order of name.
+        validation: validation examples; may be empty.
+        lookup: from the pixels of the masks to labels.
+        notes: on the split, for the user.
     """
 
     folder: Path
@@ -73,36 +77,35 @@ class TrainingSet(NamedTuple):
 
 
 def open_training_set(
-    folder: Path,
-    classes: Sequence[str],
-    *,
-    remap: Mapping[int | str, str] | None = None,
-    palette: Mapping[str, Colour] | None = None,
-    validation_share: float = 0.2,
-    seed: int = 0,
+    folder: Path, classes: Sequence[str], options: DataOptions | None = None, *, seed: int = 0
 ) -> TrainingSet:
-    """Opens a folder of `images/NAME.{png,jpg,...}`, `masks/NAME.png` and, if wanted, `train.txt` and `val.txt`.
+    """Opens a folder of `images/NAME.{png,jpg,...}`, `masks/NAME.png` and, optionally, `train.txt` and `val.txt`.
 
     Only the headers of the images are read; `check_training_set` reads the rest.
 
     Args:
-        folder: where they lie; names may be of subfolders (`images/sub/NAME.jpg`, `masks/sub/NAME.png`).
+        folder: names may be of subfolders (`images/sub/NAME.jpg`, `masks/sub/NAME.png`).
         classes: names in the order of the labels.
-        remap: class by value of the masks, see `make_mask_lookup`.
-        palette: colour of the masks by class, see `make_mask_lookup`.
-        validation_share: share of the images that validates where there is no list, in [0, 1).
-        seed: of the draw of those.
+        options: what the pixels of the masks stand for, and the share that validates where there is no list.
+        seed: of the random split.
 
     Raises:
-        UsageError: faulty classes, remap, palette or share.
+        UsageError: faulty classes, remap or palette.
         JaxmapError: files are missing, broken, or do not fit each other.
     """
-    folder = Path(folder)
-    lookup = make_mask_lookup(classes, remap, palette)
+    folder, options = Path(folder), options or DataOptions()
+    lookup = make_mask_lookup(classes, options.remap, options.palette)
     images, masks = find_files(folder / "images", IMAGE_SUFFIXES), find_files(folder / "masks", MASK_SUFFIXES)
-    split = split_names(folder, images, masks, validation_share=validation_share, seed=seed)
-    train, validation = (_examples(names, images, masks) for names in (split.train, split.validation))
-    return TrainingSet(folder, lookup.classes, train, validation, lookup, split.notes)
+    split = split_names(folder, images, masks, validation_share=options.validation_share, seed=seed)
+
+    def examples(names: Sequence[str]) -> tuple[Example, ...]:
+        sizes = _in_threads(lambda name: image_size_px(images[name][0]), names)
+        return tuple(
+            Example(name, images[name][0], masks[name][0], (height, width))
+            for name, (width, height) in zip(names, sizes, strict=True)
+        )
+
+    return TrainingSet(folder, lookup.classes, examples(split.train), examples(split.validation), lookup, split.notes)
 
 
 def read_example(example: Example, lookup: MaskLookup) -> tuple[Pixels, Labels]:
@@ -123,20 +126,14 @@ def read_example(example: Example, lookup: MaskLookup) -> tuple[Pixels, Labels]:
     return image, labels
 
 
-def check_training_set(
-    training_set: TrainingSet, advance: Callable[[int], None] = lambda done: None
-) -> Int64[np.ndarray, "2 C"]:
-    """Reads every image and mask once, so that nothing is found wrong hours later.
-
-    Args:
-        training_set: what to read.
-        advance: called with the number of examples read so far.
+def check_training_set(training_set: TrainingSet) -> Int64[np.ndarray, "2 C"]:
+    """Reads every image and mask once, so that no fault is found hours later.
 
     Returns:
         Pixels of each class in training (row 0) and in validation (row 1).
 
     Raises:
-        JaxmapError: examples that cannot be read or do not fit, masks with what stands for nothing, or
+        JaxmapError: examples that cannot be read or do not fit, masks with codes that stand for nothing, or
             classes that no training mask holds.
     """
     lookup, parts = training_set.lookup, (training_set.train, training_set.validation)
@@ -153,7 +150,7 @@ def check_training_set(
         return np.bincount(lookup.table[codes].ravel(), minlength=256)
 
     counts = np.zeros((2, 256), np.int64)
-    for (row, _), found in zip(examples, _in_threads(count, examples, advance), strict=True):
+    for (row, _), found in zip(examples, _in_threads(count, examples), strict=True):
         counts[row] += found
     if counts[:, UNNAMED].any():
         unnamed = np.flatnonzero(seen.any(axis=0) & (lookup.table == UNNAMED)).tolist()
@@ -165,9 +162,9 @@ def check_training_set(
 
 
 def digest(training_set: TrainingSet) -> str:
-    """A fingerprint of the classes, what the masks' pixels stand for, names, sizes, split and sizes of files.
+    """A fingerprint of classes, mask lookup, names, image sizes, file sizes and split, which a resumed run must share.
 
-    A resumed run must find the same. Where the folder lies does not count, nor what no example uses.
+    The path of the folder and unused files do not enter it.
 
     Raises:
         JaxmapError: a file is missing.
@@ -180,14 +177,6 @@ def digest(training_set: TrainingSet) -> str:
             sizes = (*example.size_px, _file_size(example.image), _file_size(example.mask))
             text.update(os.fsencode(f"{example.name}\0{sizes}\n"))
     return text.hexdigest()
-
-
-def _examples(names: Sequence[str], images: Files, masks: Files) -> tuple[Example, ...]:
-    sizes = _in_threads(lambda name: image_size_px(images[name][0]), names)
-    return tuple(
-        Example(name, images[name][0], masks[name][0], (height, width))
-        for name, (width, height) in zip(names, sizes, strict=True)
-    )
 
 
 def _read_rgb(example: Example) -> Pixels:
@@ -210,39 +199,29 @@ def _check_size(mask: np.ndarray, example: Example) -> None:
         )
 
 
-def _in_threads(
-    work: Callable[[Item], Result], items: Sequence[Item], advance: Callable[[int], None] = lambda done: None
-) -> list[Result]:
+def _in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """The result of each item, in order; Pillow and NumPy let threads run side by side.
 
     Raises:
-        JaxmapError: items failed; the first is told whole, the others are counted.
+        JaxmapError: items failed; the first is reported, the others are counted.
     """
     threads = ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1))
     try:
         futures = [threads.submit(work, item) for item in items]
-        for done, future in enumerate(as_completed(futures)):
+        for future in as_completed(futures):
             if not isinstance(future.exception(), JaxmapError | None):
                 future.result()
-            advance(done + 1)
     finally:
-        # An interrupted check must not go on to the last file.
+        # An interrupted check must not continue to the last file.
         threads.shutdown(cancel_futures=True)
-    _raise_together(futures)
-    return [future.result() for future in futures]
-
-
-def _raise_together(futures: Iterable[Future]) -> None:
     faults = [fault for future in futures if isinstance(fault := future.exception(), JaxmapError)]
-    if not faults:
-        return
-    first = faults[0]
-    if len(faults) == 1:
-        raise first
-    others = shortened([Path(fault.where).name for fault in faults[1:]])
-    raise JaxmapError(
-        f"{first.what} (and {len(faults) - 1} more are faulty: {others})", where=first.where, fix=first.fix
-    )
+    if len(faults) > 1:
+        first, others = faults[0], shortened([Path(fault.where).name for fault in faults[1:]])
+        what = f"{first.what} (and {len(faults) - 1} more are faulty: {others})"
+        raise JaxmapError(what, where=first.where, fix=first.fix)
+    if faults:
+        raise faults[0]
+    return [future.result() for future in futures]
 
 
 def _file_size(path: Path) -> int:
@@ -250,3 +229,125 @@ def _file_size(path: Path) -> int:
         return path.stat().st_size
     except OSError as fault:
         raise JaxmapError(f"the file cannot be read ({fault.strerror})", where=path, fix="restore the file") from fault
+
+
+class Split(NamedTuple):
+    """Sorted names of training and validation, and notes on how they were chosen."""
+
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def find_files(folder: Path, suffixes: Sequence[str]) -> Files:
+    """The files with one of these suffixes in a folder and its subfolders, by path without suffix (`sub/NAME`).
+
+    Hidden files and folders are skipped, and links to folders are not followed.
+
+    Raises:
+        JaxmapError: the folder is missing, cannot be read, or holds none.
+    """
+    found: dict[str, list[Path]] = {}
+
+    def refuse(fault: OSError) -> None:
+        fix = "training data is a folder of images/NAME.jpg and masks/NAME.png"
+        raise JaxmapError(f"the folder cannot be read ({fault.strerror})", where=folder, fix=fix) from fault
+
+    for place, subfolders, files in os.walk(folder, onerror=refuse):
+        subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
+        for path in (Path(place, name) for name in sorted(files) if not name.startswith(".")):
+            if path.suffix.lower() in suffixes:
+                found.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
+    if not found:
+        raise JaxmapError(f"no {suffixes[0]} file", where=folder, fix=f"put files there ({' '.join(suffixes)})")
+    return found
+
+
+def split_names(folder: Path, images: Files, masks: Files, *, validation_share: float, seed: int) -> Split:
+    """Splits the images of a folder into training and validation.
+
+    `train.txt` and `val.txt` list names; with only one of them, the remaining images are the other part; without
+    either, a share of the images validates, drawn at random.
+
+    Args:
+        folder: of the lists.
+        images: the image files by name.
+        masks: the mask files by name.
+        validation_share: share of the images that validates where there is no list, in [0, 1).
+        seed: of the draw, which otherwise depends on the names alone.
+
+    Raises:
+        JaxmapError: a list cannot be read, or names and files do not fit; all faults are reported together.
+    """
+    problems: list[str] = []
+    for kind, files in (("images", images), ("masks", masks)):
+        twice = [f"{name} ({', '.join(path.name for path in paths)})" for name, paths in files.items() if paths[1:]]
+        problems += [f"{_count(twice, 'name')} of several {kind}: {shortened(twice)}"] if twice else []
+    train, validation = (_listed(folder / name, images, problems) for name in (TRAIN_LIST, VALIDATION_LIST))
+    if train is None and validation is None:
+        split = _drawn(images, validation_share, seed)
+    else:
+        split = _by_lists(train, validation, images)
+    if twice := sorted(set(split.train) & set(split.validation)):
+        problems.append(f"{_count(twice, 'name')} in both {TRAIN_LIST} and {VALIDATION_LIST}: {shortened(twice)}")
+    used = {*split.train, *split.validation}
+    if bare := sorted(used - masks.keys()):
+        problems.append(f"{_count(bare, 'image')} without a mask: {shortened(bare)}")
+    # Where both lists name what is used, the rest does not matter.
+    if (train is None or validation is None) and (stray := sorted(masks.keys() - images.keys())):
+        problems.append(f"{_count(stray, 'mask')} without an image: {shortened(stray)}")
+    if not split.train and not problems:
+        problems.append("no image is left to train on")
+    if problems:
+        fix = f"each images/NAME needs a masks/NAME.png, each name stands once in {TRAIN_LIST} or {VALIDATION_LIST}"
+        raise JaxmapError("; ".join(problems), where=folder, fix=fix)
+    return split
+
+
+def _listed(path: Path, images: Files, problems: list[str]) -> list[str] | None:
+    """The names of a list, or None where there is no list; its faults are added to `problems`."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as fault:
+        raise JaxmapError(f"the list cannot be read ({fault})", where=path, fix="write one name a line") from fault
+    texts = [text for line in lines if (text := re.split(r"(?:^|\s)#", line)[0].strip())]
+    names = [_without_suffix(text, images) for text in texts]
+    if unknown := sorted({name for name in names if name not in images}):
+        problems.append(f"{_count(unknown, 'name')} without an image in {path.name}: {shortened(unknown)}")
+    if twice := sorted(name for name, times in Counter(names).items() if times > 1):
+        problems.append(f"{_count(twice, 'name')} listed twice in {path.name}: {shortened(twice)}")
+    return [name for name in names if name in images]
+
+
+def _without_suffix(text: str, images: Files) -> str:
+    """The name on a line, which may have the suffix of the image."""
+    stem, dot, suffix = text.rpartition(".")
+    return stem if text not in images and f"{dot}{suffix}".lower() in IMAGE_SUFFIXES else text
+
+
+def _by_lists(train: list[str] | None, validation: list[str] | None, images: Files) -> Split:
+    listed = {*(train or ()), *(validation or ())}
+    rest = sorted(images.keys() - listed)
+    notes = []
+    if train is not None and validation is not None and rest:
+        notes.append(f"{_count(rest, 'image')} in neither {TRAIN_LIST} nor {VALIDATION_LIST}: not used")
+    parts = [tuple(rest if names is None else sorted(set(names))) for names in (train, validation)]
+    if not parts[1]:
+        notes.append("no image validates")
+    return Split(parts[0], parts[1], tuple(notes))
+
+
+def _drawn(images: Iterable[str], share: float, seed: int) -> Split:
+    names = sorted(images)
+    count = min(max(round(share * len(names)), 1), len(names) - 1) if share > 0 else 0
+    # By hashes, so that adding images hardly changes the split of the others.
+    chosen = set(sorted(names, key=lambda name: hashlib.sha256(os.fsencode(f"{seed}/{name}")).digest())[:count])
+    note = f"{count} of {len(names)} images validate, drawn by seed {seed}" if count else "no image validates"
+    train, validation = (tuple(name for name in names if (name in chosen) == flag) for flag in (False, True))
+    return Split(train, validation, (note,))
+
+
+def _count(items: Sequence[object], noun: str) -> str:
+    return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"

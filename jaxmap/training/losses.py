@@ -1,4 +1,4 @@
-"""Losses of class logits against labels; pixels labelled `IGNORE` count in none of them."""
+"""Loss terms of class logits against labels; pixels labelled `IGNORE` count in none of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxmap.errors import UsageError
 from jaxmap.labels import IGNORE
-from jaxmap.training.options import LossOptions
+from jaxmap.training.options import PixelLossOptions
 
 _EPSILON = 1e-6
 
@@ -18,9 +18,9 @@ def total_loss(
     logits: Float[Array, "*image C"],
     labels: UInt8[Array, "*image"],
     class_weights: Float[Array, "C"],
-    options: LossOptions,
+    options: PixelLossOptions,
 ) -> Float[Array, ""]:
-    """The weighted sum of the losses that are turned on; 0 where no pixel is labelled."""
+    """The weighted sum of the loss terms; 0 where no pixel is labelled."""
     classes = logits.shape[-1]
     logits, labels = logits.reshape(-1, classes), labels.reshape(-1)
     known = labels != IGNORE
@@ -54,7 +54,7 @@ def cross_entropy(
 
 
 def soft_iou_loss(probabilities: Float[Array, "N C"], truth: Float[Array, "N C"]) -> Float[Array, ""]:
-    """One minus the intersection over union of probabilities, mean over the classes that are there.
+    """One minus the intersection over union of probabilities, mean over the classes present.
 
     Both arguments are 0 where the pixel is not labelled (Rahman & Wang 2016).
     """
@@ -66,9 +66,9 @@ def soft_iou_loss(probabilities: Float[Array, "N C"], truth: Float[Array, "N C"]
 
 
 def lovasz_loss(probabilities: Float[Array, "N C"], truth: Float[Array, "N C"]) -> Float[Array, ""]:
-    """The Lovasz extension of the Jaccard loss, mean over the classes that are there (Berman et al. 2018).
+    """The Lovasz extension of the Jaccard loss, mean over the classes present (Berman et al. 2018).
 
-    Both arguments are 0 where the pixel is not labelled: such a pixel is no error, and counts nothing.
+    Both arguments are 0 where the pixel is not labelled: such a pixel adds no error.
     """
 
     def of_class(errors: Array, area: Array) -> Array:
@@ -88,7 +88,7 @@ def _mean_over_present(losses: Array, present: Array) -> Array:
     return (losses * present).sum() / jnp.maximum(present.sum(), 1)
 
 
-def class_weights(options: LossOptions, pixels: Int[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
+def class_weights(options: PixelLossOptions, pixels: Int[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
     """The weight of each class in the cross-entropy, of mean 1.
 
     Args:

@@ -27,7 +27,6 @@ _VALUES, _COLOURS = 1 << 16, 1 << 24
 _LISTED = 8
 
 Kind = Literal["indices", "values", "colours"]
-Colour = tuple[int, int, int] | str
 
 
 class MaskLookup(NamedTuple):
@@ -45,15 +44,15 @@ class MaskLookup(NamedTuple):
 
 
 def make_mask_lookup(
-    classes: Sequence[str], remap: Mapping[int | str, str] | None, palette: Mapping[str, Colour] | None
+    classes: Sequence[str], remap: Mapping[str, str] | None, palette: Mapping[str, str] | None
 ) -> MaskLookup:
-    """Says what the pixels of the masks stand for; without either, they are class indices and 255 for none.
+    """Makes the lookup from the pixels of masks to labels; by default they are class indices, and 255 for none.
 
     Args:
         classes: names in the order of the labels.
-        remap: class by value of the mask (0 to 65535), `"ignore"` for none; the key `"*"` is every other value.
-        palette: colour by class or `"ignore"`: (R, G, B) or `"#rrggbb"`, several of these with blanks
-            between them, or `"*"` for every other colour.
+        remap: class, or `"ignore"`, by value of the mask (0 to 65535); the key `"*"` is every other value.
+        palette: colours by class or `"ignore"`: `"#rrggbb"`, several with blanks between them, or `"*"` for every
+            other colour.
 
     Raises:
         UsageError: faulty classes, values or colours, something named twice, or a class that nothing stands for.
@@ -72,8 +71,8 @@ def make_mask_lookup(
 def read_codes(path: Path, lookup: MaskLookup) -> Int32[np.ndarray, "H W"]:
     """The pixels of a mask as indices of `lookup.table`.
 
-    Values are taken as they are stored: those of a palette image are its indices, those of a bilevel
-    image 0 and 1, those of grey stored as RGB the grey level. Alpha is dropped. Colours are those seen.
+    Values are the stored ones: the indices of a palette image, 0 and 1 of a bilevel image, the grey level of grey
+    stored as RGB. Alpha is dropped. Colours are the displayed ones.
 
     Raises:
         JaxmapError: the file is missing, broken, or of colours where values are asked for.
@@ -99,7 +98,7 @@ def read_labels(path: Path, lookup: MaskLookup) -> UInt8[np.ndarray, "H W"]:
     """The labels of a mask: class indices, and 255 for none.
 
     Raises:
-        JaxmapError: the mask cannot be read, or holds what stands for nothing.
+        JaxmapError: the mask cannot be read, or holds codes that stand for nothing.
     """
     codes = read_codes(path, lookup)
     labels = lookup.table[codes]
@@ -167,7 +166,7 @@ def _checked_classes(classes: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _value_table(classes: tuple[str, ...], remap: Mapping[int | str, str]) -> np.ndarray:
+def _value_table(classes: tuple[str, ...], remap: Mapping[str, str]) -> np.ndarray:
     named: dict[int, str] = {}
     for key, name in remap.items():
         if str(key) == REST:
@@ -182,29 +181,22 @@ def _value_table(classes: tuple[str, ...], remap: Mapping[int | str, str]) -> np
     return _table(_VALUES, classes, named, remap.get(REST), _REMAP)
 
 
-def _colour_table(classes: tuple[str, ...], palette: Mapping[str, Colour]) -> np.ndarray:
+def _colour_table(classes: tuple[str, ...], palette: Mapping[str, str]) -> np.ndarray:
     named: dict[int, str] = {}
     rest: str | None = None
     for name, colours in palette.items():
-        for colour in colours.replace(",", " ").split() if isinstance(colours, str) else [colours]:
+        for colour in colours.replace(",", " ").split():
             if colour == REST:
                 if rest is not None:
                     raise UsageError(f'"{REST}" is given to {rest} and {name}', where=_PALETTE, fix="give it to one")
                 rest = name
                 continue
-            code = _colour_code(colour)
+            if not re.fullmatch("#[0-9a-fA-F]{6}", colour):
+                raise UsageError(f"{colour!r} is no colour", where=_PALETTE, fix="give #rrggbb")
+            code = int(colour[1:], 16)
             if (other := named.setdefault(code, name)) != name:
                 raise UsageError(f"{other} and {name} share #{code:06x}", where=_PALETTE, fix="a colour is one class's")
     return _table(_COLOURS, classes, named, rest, _PALETTE)
-
-
-def _colour_code(colour: Colour) -> int:
-    if isinstance(colour, str) and re.fullmatch("#[0-9a-fA-F]{6}", colour):
-        return int(colour[1:], 16)
-    if not isinstance(colour, str) and len(colour) == 3 and all(value in range(256) for value in colour):
-        red, green, blue = map(int, colour)
-        return red << 16 | green << 8 | blue
-    raise UsageError(f"{colour!r} is no colour", where=_PALETTE, fix="give #rrggbb, or three numbers from 0 to 255")
 
 
 def _table(

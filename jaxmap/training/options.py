@@ -1,36 +1,49 @@
-"""The settings of training, as frozen records that hold their own limits."""
+"""The options of training: what each stage reads, validated when it is made."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from dataclasses import field
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Interval
+from pydantic import BeforeValidator
 
+from jaxmap.errors import UsageError
+from jaxmap.host.settings import options
 from jaxmap.models.architecture import Backbone
-
-_STRICT: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
 
 Positive = Annotated[float, Gt(0)]
 NotNegative = Annotated[float, Ge(0)]
 Share = Annotated[float, Interval(ge=0, lt=1)]
 Size = Annotated[int, Interval(ge=16, le=4096)]
+MaskValue = Annotated[str, BeforeValidator(str)]
+"""A value of a mask as text: YAML reads a number, JSON and the command line text."""
 
 
-@dataclass(frozen=True)
+@options("data")
+class DataOptions:
+    """What the pixels of masks stand for, and which images validate."""
+
+    remap: dict[MaskValue, str] | None = None
+    """Class by value of the masks, such as 255 rock; "ignore" is no class, and the value * every other."""
+    palette: dict[str, str] | None = None
+    """Colour of the masks by class, such as rock #ff0000; several of a class with blanks between."""
+    validation_share: Share = 0.2
+    """Share of the images that validates where no val.txt or train.txt says."""
+
+
+@options("augmentation")
 class AugmentationOptions:
-    """How training examples are made of images; the changes of light are off unless set."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+    """How training examples are made of images; photometric changes are off by default."""
 
     crop_px: tuple[Size, Size] = (384, 384)
     """Height and width of an example."""
     scale: tuple[Positive, Positive] = (0.75, 1.75)
     """Least and greatest factor that images are resized by."""
     class_share: Annotated[float, Interval(ge=0, le=1)] = 0.0
-    """Share of the examples that are laid around a pixel of a class, each class of the image as often as the others."""
+    """Share of the crops that are placed around a pixel of a class, each class of the image as often as the others."""
     mirror: bool = True
-    """Exchange left and right of every second example."""
+    """Mirror every second example."""
     copies: Annotated[int, Ge(0)] | None = None
     """Fixed examples made of each image, beside the image itself; by default every example is drawn anew."""
     brightness: NotNegative = 0.0
@@ -42,16 +55,19 @@ class AugmentationOptions:
     gamma: NotNegative = 0.0
     """The same for the exponent of the tone curve."""
     hue_rad: NotNegative = 0.0
-    """Greatest turn of colours around the grey axis."""
+    """Greatest rotation of colours around the grey axis."""
     noise: NotNegative = 0.0
     """Standard deviation of added noise, on a scale of 0 to 255."""
 
+    def __post_init__(self) -> None:
+        low, high = self.scale
+        if low > high:
+            raise UsageError(f"augmentation.scale is {low} {high}", fix="give the least factor first")
 
-@dataclass(frozen=True)
-class LossOptions:
-    """What is made small."""
 
-    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+@options("loss")
+class PixelLossOptions:
+    """Loss terms of labelled pixels and their weights."""
 
     cross_entropy: NotNegative = 1.0
     """Weight of the cross-entropy."""
@@ -62,14 +78,16 @@ class LossOptions:
     class_weights: Literal["equal", "balanced"] | tuple[Positive, ...] = "equal"
     """Weight of each class in the cross-entropy; balanced: by one over the square root of its share of pixels."""
     label_smoothing: Share = 0.0
-    """Share of the truth spread over all classes."""
+    """Share of each target distribution that is spread over all classes."""
+
+    def __post_init__(self) -> None:
+        if not (self.cross_entropy or self.soft_iou or self.lovasz):
+            raise UsageError("every loss has a weight of 0", where="loss", fix="give one of them a weight")
 
 
-@dataclass(frozen=True)
+@options("optimiser")
 class OptimiserOptions:
-    """How the weights move."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+    """The optimiser and its schedule."""
 
     kind: Literal["adamw", "sgd"] = "adamw"
     """AdamW, or stochastic gradient descent with momentum."""
@@ -84,18 +102,16 @@ class OptimiserOptions:
     momentum: Share = 0.9
     """Of stochastic gradient descent."""
     clip_norm: Positive | None = 5.0
-    """Gradients longer than this are shortened."""
+    """Gradients are clipped to this global norm."""
     backbone_rate: Annotated[float, Interval(ge=0, le=10)] = 1.0
     """Factor on the learning rate of the backbone; 0 freezes it."""
     average: Share = 0.0
-    """Decay of a running mean of the weights that is validated and saved in their place; less at the start; 0: none."""
+    """Decay of an exponential moving average of the weights, which is validated and saved in their place; 0: none."""
 
 
-@dataclass(frozen=True)
-class NormOptions:
-    """Which batch norms learn from the batch; the others keep the statistics they came with."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+@options("norm")
+class BatchNormOptions:
+    """Which batch norms train; the frozen ones keep their statistics."""
 
     backbone: Literal["auto", "batch", "frozen"] = "auto"
     """Of the backbone; auto: frozen where it was trained before."""
@@ -103,11 +119,9 @@ class NormOptions:
     """Of ASPP and decoder; auto: frozen where they were trained before."""
 
 
-@dataclass(frozen=True)
+@options()
 class TrainingOptions:
-    """Everything that decides what a training run comes out as, but its data and its network."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+    """The training recipe: everything but data and network."""
 
     epochs: Annotated[int, Gt(0)] = 60
     """How often every example is seen."""
@@ -120,16 +134,14 @@ class TrainingOptions:
     seed: Annotated[int, Interval(ge=0, lt=2**31)] = 0
     """Seed of all randomness."""
     augmentation: AugmentationOptions = field(default_factory=AugmentationOptions)
-    loss: LossOptions = field(default_factory=LossOptions)
+    loss: PixelLossOptions = field(default_factory=PixelLossOptions)
     optimiser: OptimiserOptions = field(default_factory=OptimiserOptions)
-    norm: NormOptions = field(default_factory=NormOptions)
+    norm: BatchNormOptions = field(default_factory=BatchNormOptions)
 
 
-@dataclass(frozen=True)
+@options("network")
 class NetworkOptions:
-    """The network; what is left open is as in the file that training starts from, or as its family has it."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = _STRICT
+    """The network; what is not set is as in the file that training starts from, or the default of the family."""
 
     backbone: Backbone | None = None
     """What computes the features; mobilenet_v2 unless --init says otherwise."""

@@ -1,34 +1,35 @@
-"""The compiled training step: one batch of images into the weights."""
+"""The compiled training step: augmentation, loss and gradient of one batch, then the optimiser."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from jaxmap.labels import IGNORE
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, training_form
 from jaxmap.training.augment import augment
 from jaxmap.training.losses import total_loss
-from jaxmap.training.optimiser import make_optimiser, poly_rate, trained_names
-from jaxmap.training.options import TrainingOptions
+from jaxmap.training.options import OptimiserOptions, TrainingOptions
+
+_STATISTICS = (".norm.mean", ".norm.var")
 
 
 class Batch(NamedTuple):
-    """Images as they were read, and what is to be made of each.
+    """Images as they were read, and what augmentation needs to make the examples.
 
     Attributes:
         images: RGB, padded below and to the right to one size.
         labels: of the same pixels; `IGNORE` in the padding.
         sizes_px: height and width of each image without it.
-        draws: what the randomness of each example is drawn from: (epoch, or 0 where examples are fixed; example).
-        originals: whether the image itself is the example, not a crop of it.
+        draws: folded into the key of each example: (epoch, or 0 where examples are fixed; example).
+        originals: whether the whole image is the example, not a crop of it.
     """
 
     images: UInt8[Array, "B H W 3"]
@@ -41,11 +42,11 @@ class Batch(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """All that a training run carries from step to step.
+    """What a training run carries from step to step.
 
     Attributes:
         weights: of the network, running statistics included.
-        average: running mean of the weights; empty where none is kept.
+        average: exponential moving average of the weights; empty where none is kept.
         optimiser: state of the optimiser.
         step: steps taken.
     """
@@ -56,8 +57,8 @@ class TrainState:
     step: Int[Array, ""]
 
 
-class StepInfo(NamedTuple):
-    """What one step did; where `finite` is false, loss, gradient or new weights were not, and nothing was changed."""
+class StepMetrics(NamedTuple):
+    """Metrics of one step; where loss, gradient or new weights were not finite, the state was left unchanged."""
 
     loss: Float[Array, ""]
     accuracy: Float[Array, ""]
@@ -71,13 +72,13 @@ class Trainer(NamedTuple):
 
     Attributes:
         init: `(weights) -> TrainState`.
-        step: `(state, batch, key) -> (state, StepInfo)`, compiled once; the state passed in is donated. The
-            key is the run's: what is random depends on the batch's draws and the number of the step.
-        loss: `(weights, images, labels, key) -> (loss, (logits, statistics))`, to be differentiated or looked at.
+        step: `(state, batch, key) -> (state, StepMetrics)`, compiled once; the state passed in is donated. The
+            key is the same for all steps: draws and the number of the step are folded into it.
+        loss: `(weights, images, labels, key) -> (loss, (logits, statistics))`, not compiled.
     """
 
     init: Callable[[Weights], TrainState]
-    step: Callable[[TrainState, Batch, PRNGKeyArray], tuple[TrainState, StepInfo]]
+    step: Callable[[TrainState, Batch, PRNGKeyArray], tuple[TrainState, StepMetrics]]
     loss: Callable[..., tuple[Array, tuple[Array, Weights]]]
 
 
@@ -96,8 +97,7 @@ def make_trainer(
         options: the recipe.
         steps: of the whole run, for the schedule.
         class_weights: of the cross-entropy.
-        batch_norms: prefixes of the blocks whose batch norms take their statistics from the batch and
-            learn from it; the others keep theirs.
+        batch_norms: prefixes of the blocks whose batch norms train; the others are frozen.
     """
     network = training_form(architecture, batch_norms)
     updater = make_updater(options, steps)
@@ -114,16 +114,16 @@ def make_trainer(
 
         return jax.vmap(one)(*batch)
 
-    def step(state: TrainState, batch: Batch, key: PRNGKeyArray) -> tuple[TrainState, StepInfo]:
-        view_key, dropout_key = jax.random.split(key)
+    def step(state: TrainState, batch: Batch, key: PRNGKeyArray) -> tuple[TrainState, StepMetrics]:
+        augment_key, dropout_key = jax.random.split(key)
         with jax.named_scope("augment"):
-            images, labels = jax.lax.optimization_barrier(examples(batch, view_key))
-        moved, fixed = parted(state.weights, options)
+            images, labels = jax.lax.optimization_barrier(examples(batch, augment_key))
+        trained, fixed = parted(state.weights, options)
 
-        def of_moved(moved: Weights) -> tuple[Array, tuple[Array, Weights]]:
-            return loss({**fixed, **moved}, images, labels, jax.random.fold_in(dropout_key, state.step))
+        def of_trained(trained: Weights) -> tuple[Array, tuple[Array, Weights]]:
+            return loss({**fixed, **trained}, images, labels, jax.random.fold_in(dropout_key, state.step))
 
-        (value, (logits, statistics)), gradient = jax.value_and_grad(of_moved, has_aux=True)(moved)
+        (value, (logits, statistics)), gradient = jax.value_and_grad(of_trained, has_aux=True)(trained)
         known = labels != IGNORE
         right = known & (logits.argmax(axis=-1) == labels)
         accuracy = right.sum() / jnp.maximum(known.sum(), 1)
@@ -133,20 +133,20 @@ def make_trainer(
 
 
 class Updater(NamedTuple):
-    """How gradients become new weights, whatever the loss was of.
+    """The optimiser of a run, whatever the loss.
 
     Attributes:
         init: `(weights) -> TrainState`.
-        update: `(state, loss, accuracy, gradient, statistics) -> (state, StepInfo)`, with the gradient of the weights
-            that move (`parted`) and the running statistics that the step has changed.
+        update: `(state, loss, accuracy, gradient, statistics) -> (state, StepMetrics)`, with the gradient of the
+            trained weights (`parted`) and the running statistics that the step has changed.
     """
 
     init: Callable[[Weights], TrainState]
-    update: Callable[[TrainState, Array, Array, Weights, Weights], tuple[TrainState, StepInfo]]
+    update: Callable[[TrainState, Array, Array, Weights, Weights], tuple[TrainState, StepMetrics]]
 
 
 def make_updater(options: TrainingOptions, steps: int) -> Updater:
-    """Builds the optimiser of a run of so many steps, and what goes with it."""
+    """Builds the optimiser of a run of so many steps, with its moving average and its test of finiteness."""
     optimiser = make_optimiser(options.optimiser, steps)
     rate = poly_rate(options.optimiser, steps)
     decay = options.optimiser.average
@@ -154,34 +154,76 @@ def make_updater(options: TrainingOptions, steps: int) -> Updater:
     def init(weights: Weights) -> TrainState:
         # Copies: the state is donated, and the caller's weights are not.
         weights = jax.tree.map(jnp.array, weights)
-        moved, _ = parted(weights, options)
+        trained, _ = parted(weights, options)
         average = jax.tree.map(jnp.array, weights) if decay else {}
-        return TrainState(weights, average, optimiser.init(moved), jnp.zeros((), jnp.int32))
+        return TrainState(weights, average, optimiser.init(trained), jnp.zeros((), jnp.int32))
 
     def update(
         state: TrainState, value: Array, accuracy: Array, gradient: Weights, statistics: Weights
-    ) -> tuple[TrainState, StepInfo]:
+    ) -> tuple[TrainState, StepMetrics]:
         with jax.named_scope("optimiser"):
-            moved, fixed = parted(state.weights, options)
-            updates, optimiser_state = optimiser.update(gradient, state.optimiser, moved)
-            moved = cast(Weights, optax.apply_updates(moved, updates))
-            weights = {**fixed, **moved, **statistics}
-            # Young averages must not hold on to the first, random weights.
-            held = jnp.minimum(decay, (1 + state.step) / (10 + state.step))
-            average = {name: held * mean + (1 - held) * weights[name] for name, mean in state.average.items()}
+            trained, fixed = parted(state.weights, options)
+            updates, optimiser_state = optimiser.update(gradient, state.optimiser, trained)
+            trained = cast(Weights, optax.apply_updates(trained, updates))
+            weights = {**fixed, **trained, **statistics}
+            # The decay is smaller at first, so that the random weights of the start are soon forgotten.
+            kept = jnp.minimum(decay, (1 + state.step) / (10 + state.step))
+            average = {name: kept * mean + (1 - kept) * weights[name] for name, mean in state.average.items()}
             norm = optax.global_norm(gradient)
             finite = jnp.isfinite(value) & jnp.isfinite(norm)
             for weight in weights.values():
                 finite &= jnp.isfinite(weight).all()
             new = TrainState(weights, average, optimiser_state, state.step + 1)
             new = jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state)
-        return new, StepInfo(value, accuracy, norm, jnp.asarray(rate(state.step)), finite)
+        return new, StepMetrics(value, accuracy, norm, jnp.asarray(rate(state.step)), finite)
 
     return Updater(init, update)
 
 
 def parted(weights: Weights, options: TrainingOptions) -> tuple[Weights, Weights]:
-    """The weights that the optimiser moves, and the others."""
+    """The weights that the optimiser updates, and the others."""
     names = trained_names(weights, options.optimiser)
-    moved = {name: weight for name, weight in weights.items() if name in names}
-    return moved, {name: weight for name, weight in weights.items() if name not in names}
+    trained = {name: weight for name, weight in weights.items() if name in names}
+    return trained, {name: weight for name, weight in weights.items() if name not in names}
+
+
+def poly_rate(options: OptimiserOptions, steps: int) -> optax.Schedule:
+    """Learning rate by step: linear warm-up times the poly schedule of DeepLab (Chen et al. 2017)."""
+
+    def rate(step: ArrayLike) -> Float[Array, ""]:
+        left = jnp.clip(1 - jnp.asarray(step) / max(steps, 1), 0, 1)
+        warmup = jnp.clip((jnp.asarray(step) + 1) / max(options.warmup_steps, 1), 0, 1)
+        return jnp.asarray(options.learning_rate * left**options.power * warmup, jnp.float32)
+
+    return rate
+
+
+def is_statistic(name: str) -> bool:
+    """Whether a weight is a running statistic of batch norm, which has no gradient."""
+    return name.endswith(_STATISTICS)
+
+
+def trained_names(names: Iterable[str], options: OptimiserOptions) -> frozenset[str]:
+    """The names of the weights that the optimiser updates."""
+    frozen = ("backbone.",) if options.backbone_rate == 0 else ()
+    return frozenset(name for name in names if not is_statistic(name) and not name.startswith(frozen))
+
+
+def make_optimiser(options: OptimiserOptions, steps: int) -> optax.GradientTransformation:
+    """The chain of gradient transformations over weights by dotted path; only kernels decay."""
+    rate, factor = poly_rate(options, steps), options.backbone_rate
+
+    def kernels(weights: Mapping[str, Array]) -> dict[str, bool]:
+        return {name: name.endswith(".kernel") for name in weights}
+
+    def scale_backbone(updates: Mapping[str, Array], _: object = None) -> dict[str, Array]:
+        return {name: update * factor if name.startswith("backbone.") else update for name, update in updates.items()}
+
+    clip = optax.clip_by_global_norm(options.clip_norm) if options.clip_norm else optax.identity()
+    if options.kind == "adamw":
+        descent = optax.adamw(rate, weight_decay=options.weight_decay, mask=kernels)
+    else:
+        decay = optax.add_decayed_weights(options.weight_decay, mask=kernels)
+        descent = optax.chain(decay, optax.sgd(rate, options.momentum))
+    scale = optax.stateless(scale_backbone) if factor != 1 else optax.identity()  # type: ignore[arg-type]
+    return optax.chain(clip, descent, scale)

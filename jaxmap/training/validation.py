@@ -1,4 +1,4 @@
-"""Validation: the network, as it is so far, on images it does not learn from."""
+"""Validation of a network on images that it is not trained on."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from jaxmap.models.deeplab import Weights, fold_batch_norm, pure_network
 from jaxmap.training.data import Example, read_example
 from jaxmap.training.masks import MaskLookup
 
-SHOWN = 6
+MAX_EXAMPLES = 6
+"""Images of a validation that are kept for the report."""
 
 
-class Shown(NamedTuple):
-    """An image, what it shows, and what the network says of it."""
+class ValidationExample(NamedTuple):
+    """An image, its true labels, and those of the network."""
 
     name: str
     image: UInt8[np.ndarray, "H W 3"]
@@ -30,26 +31,26 @@ class Shown(NamedTuple):
 
 
 class Validation(NamedTuple):
-    """What came out of one validation.
+    """The result of one validation.
 
     Attributes:
         summary: as `SegmentationScores.summary`.
         loss: mean negative log-likelihood of the labelled pixels; None where there are none.
-        shown: some of the images, spread over all.
+        examples: some of the images, spread evenly over all.
     """
 
     summary: dict
     loss: float | None
-    shown: tuple[Shown, ...]
+    examples: tuple[ValidationExample, ...]
 
 
-class Validator:
-    """Scores weights on images at their own size; it compiles once for each size.
+class ImageValidator:
+    """Scores weights on images at their own size; compiled once for each size.
 
     Args:
         architecture: of the network.
         examples: the images.
-        lookup: what the pixels of their masks stand for.
+        lookup: from the pixels of their masks to labels.
     """
 
     def __init__(self, architecture: Architecture, examples: Sequence[Example], lookup: MaskLookup) -> None:
@@ -62,20 +63,20 @@ class Validator:
         """Scores weights, running statistics included.
 
         Raises:
-            JaxmapError: an image cannot be read any more, or the network's answer to it is not finite.
+            JaxmapError: an image cannot be read any more, or the network's output for it is not finite.
         """
         folded = self._fold(weights)
         if self._run is None:
             architecture, _ = fold_batch_norm(self._architecture, weights)
             self._run = jax.jit(pure_network(architecture, folded).apply)
-        scores, losses, pixels, shown = SegmentationScores.empty(self._architecture.classes), 0.0, 0, []
-        places = set(np.linspace(0, len(self._examples) - 1, SHOWN).round().astype(int).tolist())
+        scores, losses, pixels, examples = SegmentationScores.empty(self._architecture.classes), 0.0, 0, []
+        places = set(np.linspace(0, len(self._examples) - 1, MAX_EXAMPLES).round().astype(int).tolist())
         for place, example in enumerate(self._examples):
             image, truth = read_example(example, self._lookup)
             logits = np.asarray(self._run(folded, image[None])[0])  # type: ignore[operator]
             if not np.isfinite(logits).all():
                 raise JaxmapError(
-                    "the network's answer to a validation image is not finite",
+                    "the network's output for a validation image is not finite",
                     where=example.image,
                     fix="take a lower optimiser.learning-rate and start anew",
                 )
@@ -83,8 +84,8 @@ class Validator:
             summed, counted = _negative_log_likelihood(logits, truth)
             losses, pixels = losses + summed, pixels + counted
             if place in places:
-                shown.append(Shown(example.name, image, truth, logits.argmax(axis=-1).astype(np.uint8)))
-        return Validation(scores.summary(), losses / pixels if pixels else None, tuple(shown))
+                examples.append(ValidationExample(example.name, image, truth, logits.argmax(axis=-1).astype(np.uint8)))
+        return Validation(scores.summary(), losses / pixels if pixels else None, tuple(examples))
 
 
 def _negative_log_likelihood(logits: Float[np.ndarray, "H W C"], truth: UInt8[np.ndarray, "H W"]) -> tuple[float, int]:

@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
 from jaxmap.labels import IGNORE
-from jaxmap.training.augment import View, change_light_inside, cut, cut_nearest, draw_view
+from jaxmap.training.augment import CropWindow as View
+from jaxmap.training.augment import change_light_inside, cut, cut_nearest
+from jaxmap.training.augment import draw_window as draw_view
 from jaxmap.training.options import AugmentationOptions
 from jaxmap.types import StereoCamera
 

@@ -28,7 +28,8 @@ from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, training_form
 from jaxmap.models.resizing import resize_bilinear
 from jaxmap.training.options import TrainingOptions
-from jaxmap.training.step import StepInfo, TrainState, make_updater, parted
+from jaxmap.training.step import StepMetrics
+from jaxmap.training.step import TrainState, make_updater, parted
 from jaxmap.tuning.frame_crops import FrameBatch, crop_frame, points_per_pixel, widest_camera
 from jaxmap.tuning.map_loss import MapTruth, cells_loss, soft_cells
 from jaxmap.tuning.options import MapLossOptions
@@ -83,14 +84,14 @@ class MapTrainer(NamedTuple):
 
     Attributes:
         init: `(weights) -> TrainState`.
-        step: `(state, batch, key) -> (state, StepInfo)`, compiled once; the state passed in is donated. The key is
+        step: `(state, batch, key) -> (state, StepMetrics)`, compiled once; the state passed in is donated. The key is
             the run's.
         loss: `(weights, batch, key) -> (loss, accuracy)`: what the step makes small, to be differentiated or looked at.
         pull_back: `(weights, batch, key) -> Pulled`: the same with its gradient, as the step takes it.
     """
 
     init: Callable[[Weights], TrainState]
-    step: Callable[[TrainState, FrameBatch, PRNGKeyArray], tuple[TrainState, StepInfo]]
+    step: Callable[[TrainState, FrameBatch, PRNGKeyArray], tuple[TrainState, StepMetrics]]
     loss: Callable[[Weights, FrameBatch, PRNGKeyArray], tuple[Array, Array]]
     pull_back: Callable[[Weights, FrameBatch, PRNGKeyArray], Pulled]
 
@@ -170,7 +171,7 @@ def make_map_trainer(architecture: Architecture, options: TrainingOptions, site:
             gradient, _ = jax.lax.scan(pull, jax.tree.map(jnp.zeros_like, moved), batch)
         return Pulled(value + site.anchor * held, accuracy, gradient)
 
-    def step(state: TrainState, batch: FrameBatch, key: PRNGKeyArray) -> tuple[TrainState, StepInfo]:
+    def step(state: TrainState, batch: FrameBatch, key: PRNGKeyArray) -> tuple[TrainState, StepMetrics]:
         pulled = pull_back(state.weights, batch, key)
         return updater.update(state, pulled.loss, pulled.accuracy, pulled.gradient, {})
 

@@ -46,7 +46,7 @@ from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.options import StereoOptions
 from jaxmap.training.losses import total_loss
 from jaxmap.training.optimiser import is_statistic
-from jaxmap.training.options import LossOptions
+from jaxmap.training.options import PixelLossOptions
 from jaxmap.tuning.pull_back import make_pull_back, map_gradient
 from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_grid, make_voxel_map
 
@@ -202,7 +202,7 @@ def training_step(images: np.ndarray, labels: np.ndarray) -> Prepared:
 
     def loss(trained: Weights, fixed: Weights) -> tuple[jax.Array, Weights]:
         logits, statistics = network({**trained, **fixed}, images, KEY)
-        return total_loss(logits, labels, jnp.ones(logits.shape[-1]), LossOptions()), statistics
+        return total_loss(logits, labels, jnp.ones(logits.shape[-1]), PixelLossOptions()), statistics
 
     def step(state: tuple[Weights, Weights, Any]) -> tuple[Weights, Weights, Any]:
         trained, fixed, memory = state

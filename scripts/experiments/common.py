@@ -19,8 +19,8 @@ import numpy as np
 from jaxmap.datasets.label_raster import LabelRaster
 from jaxmap.evaluation.cells import CellGrid, column_shares, make_cells, map_cells
 from jaxmap.evaluation.evaluate import ClassLayer, evaluate_map
-from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.evaluation.map_scores import Confusion, confusion_scores, count_confusion
+from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.evaluation.truth_cells import truth_cells
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.files import bundled

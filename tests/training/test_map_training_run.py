@@ -1,4 +1,4 @@
-"""`jaxmap train --supervision map`: what it writes, that it goes on exactly, and what it refuses."""
+"""Map supervision: what a run writes, that it is resumed exactly, and what is refused."""
 
 from __future__ import annotations
 
@@ -17,9 +17,13 @@ from tiny_training import ARCHITECTURE as TINY
 from tiny_training import network_is_tiny  # noqa: F401
 from truth_files import write_raster
 
+from jaxmap.errors import JaxmapError
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.models.checkpoint import load_network, save_model
 from jaxmap.models.deeplab import initial_weights
+from jaxmap.runs.map_training import plan_map_training
+from jaxmap.runs.training import TrainingFolder, TrainingRun
+from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainConfig, TrainingPlan
 
 CONFIG = """\
 supervision: map
@@ -71,13 +75,43 @@ def words(place: Path, out: Path, *more: object) -> list[object]:
     return given
 
 
-@pytest.fixture(scope="module")
-def finished(place, tmp_path_factory) -> Path:
-    """The folder of an uninterrupted run; only to be read."""
-    from jaxmap.commands.main import main
+def config_of(place: Path, **changes: object) -> TrainConfig:
+    """The configuration, with changes by key, in which __ stands for the dot."""
+    config = replace(TRAIN_SETTINGS.load(str(place / "map.yaml")), ground_truth=place / "truth.tif")
+    for key, value in changes.items():
+        section, _, name = key.partition("__")
+        if "__" in name:
+            inner, _, name = name.partition("__")
+            part = getattr(config, section)
+            value = replace(part, **{inner: replace(getattr(part, inner), **{name: value})})
+        elif name:
+            value = replace(getattr(config, section), **{name: value})
+        config = replace(config, **{section: value})
+    return config
 
+
+def planned(place: Path, config: TrainConfig) -> TrainingPlan:
+    return plan_map_training(str(place / "sequence"), config, place / "first.safetensors", notify=lambda line: None)
+
+
+@pytest.fixture(scope="module")
+def plan(place, shared_cache) -> TrainingPlan:
+    """The plan of all runs, whose step is compiled once."""
+    return planned(place, config_of(place))
+
+
+def go(plan: TrainingPlan, out: Path, *, resume: bool = False) -> None:
+    out.mkdir(exist_ok=True)
+    folder = TrainingFolder(out)
+    folder.begin(plan, resume=resume, overwrite=False)
+    TrainingRun(plan, folder, notify=lambda line: None).run()
+
+
+@pytest.fixture(scope="module")
+def finished(plan, tmp_path_factory) -> Path:
+    """The folder of an uninterrupted run; only to be read."""
     out = tmp_path_factory.mktemp("map_run") / "run"
-    assert main([str(word) for word in words(place, out)]) == 0
+    go(plan, out)
     return out
 
 
@@ -86,6 +120,7 @@ def history_of(run: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k not in ("seconds", "images_per_s")} for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_a_run_writes_what_a_run_on_images_writes(finished, place):
     written = {path.name for path in finished.iterdir()}
     assert written == {"model.safetensors", "history.csv", "metrics.json", "config.yaml", "report.html", "checkpoints"}
@@ -105,41 +140,41 @@ def test_a_run_writes_what_a_run_on_images_writes(finished, place):
     assert "no image is labelled" in page and "true cells" in page
 
 
-def test_an_interrupted_run_goes_on_exactly(cli, finished, place, tmp_path, monkeypatch):
-    from jaxmap.runs.training import TrainingRun
-
+@pytest.mark.slow
+def test_an_interrupted_run_is_resumed_exactly(plan, finished, tmp_path, monkeypatch):
     def cut(self, epoch, state, meter):
-        kept(self, epoch, state, meter)
+        whole(self, epoch, state, meter)
         if epoch == 1:
             raise KeyboardInterrupt
 
-    kept = TrainingRun._end_epoch
-    monkeypatch.setattr(TrainingRun, "_end_epoch", cut)
-    run = tmp_path / "run"
-    assert cli(*words(place, run)).status != 0
-    monkeypatch.setattr(TrainingRun, "_end_epoch", kept)
-    assert cli(*words(place, run, "--resume")).status == 0
+    run, whole = tmp_path / "run", TrainingRun._end_epoch
+    with monkeypatch.context() as patched:
+        patched.setattr(TrainingRun, "_end_epoch", cut)
+        with pytest.raises(KeyboardInterrupt):
+            go(plan, run)
+    go(plan, run, resume=True)
     assert (run / "model.safetensors").read_bytes() == (finished / "model.safetensors").read_bytes()
     assert history_of(run) == history_of(finished)
 
 
 SLOWLY = """\
 import sys, time
-from jaxmap.runs.training import Meter
+from jaxmap.runs.training import EpochMeter
 from tiny_training import main, tiny_network
 
-add = Meter.add
+add = EpochMeter.add
 def slowly(*words):
     time.sleep(0.5)
     return add(*words)
-Meter.add = slowly
+EpochMeter.add = slowly
 with tiny_network():
     sys.exit(main(sys.argv[1:]))
 """
 """Each step takes a while, so that the process dies in the middle of the run."""
 
 
-def test_a_killed_process_is_gone_on_with(cli, finished, place, tmp_path):
+@pytest.mark.slow
+def test_a_killed_process_is_resumed(cli, finished, place, tmp_path):
     run = tmp_path / "run"
     kill_when(lambda: [path for path in run.glob("checkpoints/*") if path.name.isdecimal()], SLOWLY, words(place, run))
     assert len(history_of(run)) < len(history_of(finished))
@@ -150,12 +185,7 @@ def test_a_killed_process_is_gone_on_with(cli, finished, place, tmp_path):
     assert {path.name for path in run.iterdir()} == {path.name for path in finished.iterdir()}, "no leftovers"
 
 
-def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(place):
-    from jaxmap.runs.map_training import plan_map_training
-    from jaxmap.runs.training_plan import load_train_config
-
-    config = replace(load_train_config(str(place / "map.yaml")), ground_truth=place / "truth.tif")
-    plan = plan_map_training(str(place / "sequence"), config, place / "first.safetensors", notify=lambda line: None)
+def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(plan):
     for index, kept in enumerate(plan.data.train):
         seen = scenes.scene_frame(index)
         known = kept.cells != IGNORE
@@ -167,44 +197,50 @@ def test_the_truth_of_a_pixel_is_that_of_the_cell_it_lies_in(place):
 
 
 FAULTS = {
-    "no orthomosaic": (2, ("--ground-truth", "None"), "needs an orthomosaic"),
-    "a range of none": (2, ("--augmentation.scale", "2", "1"), "least factor"),
-    "a loss of pixels": (2, ("--loss.lovasz", "1"), "are of pixels"),
-    "no loss": (2, ("--loss.cross-entropy", "0", "--loss.soft-iou", "0"), "weight of 0"),
-    "fixed copies": (2, ("--augmentation.copies", "3"), "is for images"),
-    "an ensemble": (2, ("--mapping.ensemble.members", "2"), "mapping.ensemble.members says nothing"),
-    "another labeller": (2, ("--mapping.labeller", "plane"), "mapping.labeller says nothing"),
-    "labels of others": (2, ("--mapping.labels", "there"), "mapping.labels says nothing"),
-    "classes that the network has not": (2, ("--classes", "background", "mud", "rock"), "would be random"),
-    "a truth of one known class": (2, ("--map-truth.remap", "1=mud", "2=rock"), "fewer than two classes"),
-    "codes without a meaning": (1, ("--map-truth.remap", "1=sand", "3=rock"), "mean nothing"),
-    "no such orthomosaic": (1, ("--ground-truth", "gone.tif"), "no such file"),
-    "codes that are told": (1, ("--map-truth.remap", "1=sand", "3=rock"), "name them all (--map-truth.remap "),
+    "no orthomosaic": (2, dict(ground_truth=None), "needs an orthomosaic"),
+    "a loss of pixels": (2, dict(loss__lovasz=1), "are of pixels"),
+    "fixed copies": (2, dict(augmentation__copies=3), "is for images"),
+    "an ensemble": (2, dict(mapping__ensemble__members=2), "mapping.ensemble.members has no effect"),
+    "another labeller": (2, dict(mapping__labeller="plane"), "mapping.labeller has no effect"),
+    "labels of others": (2, dict(mapping__labels=Path("there")), "mapping.labels has no effect"),
+    "classes that the network has not": (2, dict(classes=("background", "mud", "rock")), "would be random"),
+    "a truth of one known class": (2, dict(map_truth__remap=("1=mud", "2=rock")), "fewer than two classes"),
+    "no such orthomosaic": (1, dict(ground_truth=Path("gone.tif")), "no such file"),
+    "codes without a meaning": (
+        1,
+        dict(map_truth__remap=("1=sand", "3=rock")),
+        "jaxmap evaluate (options below map_truth): label values that mean nothing",
+    ),
     "a truth of another system": (
         1,
-        ("--mapping.crs", "EPSG:32631", "--map-truth.crs", "EPSG:32633"),
+        dict(mapping__crs="EPSG:32631", map_truth__crs="EPSG:32633"),
         "does not lie over the map",
     ),
-    "no depth": (2, ("--mapping.depth.min-m", "9"), "set --mapping.depth.max-m"),
     "too large a map": (
         1,
-        ("--mapping.grid.max-memory-gib", "1e-5"),
-        "or raise --mapping.grid.max-memory-gib",
+        dict(mapping__grid__max_memory_gib=1e-5),
+        "jaxmap map (options below mapping): ",
     ),
-    "no poses": (1, ("--mapping.poses", "gone.tum"), "there is no file gone.tum"),
-    "no frame to teach": (1, ("--data.validation-share", "0.95"), "held out"),
+    "no poses": (1, dict(mapping__poses=Path("gone.tum")), "there is no file gone.tum"),
+    "no frame to train on": (1, dict(data__validation_share=0.95), "held out"),
 }
 
 
+def fault_of(place: Path, config: TrainConfig) -> tuple[int, str]:
+    with pytest.raises(JaxmapError) as caught:
+        planned(place, config)
+    return caught.value.exit_code, str(caught.value)
+
+
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_does_not_serve_is_refused_in_one_line(name, cli, place, tmp_path):
-    status, more, told = FAULTS[name]
-    outcome = cli(*words(place, tmp_path / "run", *more))
-    assert (outcome.status, told in outcome.error) == (status, True), outcome.error
+def test_unusable_settings_are_refused(name, place):
+    status, changes, part = FAULTS[name]
+    found = fault_of(place, config_of(place, **changes))
+    assert (found[0], part in found[1]) == (status, True), found
 
 
 @pytest.mark.parametrize(
-    ("change", "west", "told"),
+    ("change", "west", "part"),
     [
         (lambda labels: np.ones_like(labels), WEST, "one class teaches nothing"),
         (lambda labels: np.zeros_like(labels), WEST, "no cell of the map is labelled"),
@@ -214,13 +250,18 @@ def test_what_does_not_serve_is_refused_in_one_line(name, cli, place, tmp_path):
     ],
     ids=["one class", "nothing labelled", "elsewhere", "not seen"],
 )
-def test_an_orthomosaic_that_teaches_nothing_is_refused(change, west, told, cli, place, tmp_path):
+def test_an_orthomosaic_without_information_is_refused(change, west, part, place, tmp_path):
     truth = write_truth(tmp_path / "other.tif", change(orthomosaic()), west=west)
-    outcome = cli(*words(place, tmp_path / "run", "--ground-truth", truth))
-    assert (outcome.status, told in outcome.error) == (1, True), outcome.error
-    assert not (tmp_path / "run" / "model.safetensors").exists()
+    found = fault_of(place, config_of(place, ground_truth=truth))
+    assert (found[0], part in found[1]) == (1, True), found
 
 
-def test_an_orthomosaic_without_map_supervision_is_refused(cli, place, tmp_path):
+def test_the_command_plans_by_supervision_and_its_errors_name_options_that_exist(cli, place, tmp_path):
+    outcome = cli(*words(place, tmp_path / "run", "--mapping.depth.min-m", "9"))
+    assert outcome.status == 2 and "jaxmap map (options below mapping): " in outcome.error
+    assert "set --depth.max-m" in outcome.error
     outcome = cli(*words(place, tmp_path / "run", "--supervision", "pixels"))
     assert outcome.status == 2 and "pixels supervise" in outcome.error
+    outcome = cli(*words(place, tmp_path / "run", "--mapping.grid.voxel-size-m", "-1"))
+    assert outcome.status == 2 and "voxel_size_m is -1.0" in outcome.error
+    assert not (tmp_path / "run" / "model.safetensors").exists()

@@ -12,10 +12,22 @@ import pytest
 import reference_augment
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from tiny_training import compiled_quickly
 
 from jaxmap.labels import IGNORE
-from jaxmap.training.augment import View, augment, change_light, cut, draw_pixel, draw_view, whole_view
+from jaxmap.training.augment import (
+    CropWindow,
+    augment,
+    change_light,
+    cut,
+    cut_nearest,
+    draw_pixel,
+    draw_window,
+    whole_window,
+)
 from jaxmap.training.options import AugmentationOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 STORED_PX = (20, 24)
 """Images are padded to this, so that each function is compiled once for all sizes."""
@@ -26,8 +38,8 @@ OPTIONS = AugmentationOptions(crop_px=CROP_PX, scale=(0.4, 2.5))
 LIGHT = replace(OPTIONS, brightness=0.5, contrast=0.5, saturation=0.5, gamma=0.5, hue_rad=0.5, noise=9.0)
 
 fast_cut = jax.jit(partial(cut, crop_px=CROP_PX, fill=FILL))
-fast_draw = jax.jit(partial(draw_view, options=OPTIONS))
-around_draw = jax.jit(partial(draw_view, options=replace(OPTIONS, class_share=1.0)))
+fast_draw = jax.jit(partial(draw_window, options=OPTIONS))
+around_draw = jax.jit(partial(draw_window, options=replace(OPTIONS, class_share=1.0)))
 draw_pixels = jax.jit(jax.vmap(draw_pixel, in_axes=(0, None, None)))
 fast_augment = jax.jit(partial(augment, options=OPTIONS, fill=FILL))
 lit_augment = jax.jit(jax.vmap(partial(augment, options=LIGHT, fill=FILL)))
@@ -39,12 +51,12 @@ offsets = st.tuples(st.integers(-20, 40), st.integers(-20, 40))
 seeds = st.integers(0, 2**31 - 1)
 
 
-def view_of(scale: float, offset_px: tuple[int, int], mirrored: bool) -> View:
-    return View(jnp.float32(scale), jnp.array(offset_px, jnp.int32), jnp.array(mirrored))
+def view_of(scale: float, offset_px: tuple[int, int], mirrored: bool) -> CropWindow:
+    return CropWindow(jnp.float32(scale), jnp.array(offset_px, jnp.int32), jnp.array(mirrored))
 
 
 def example(size_px: tuple[int, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image and its labels, 0 to 4 and `IGNORE`; what pads them is told apart: white, of label 99."""
+    """An image and its labels, 0 to 4 and `IGNORE`; the padding is white, of label 99."""
     draw = np.random.default_rng(seed)
     image = np.full((*STORED_PX, 3), 255, np.uint8)
     labels = np.full(STORED_PX, 99, np.uint8)
@@ -53,7 +65,7 @@ def example(size_px: tuple[int, int], seed: int) -> tuple[np.ndarray, np.ndarray
     return image, labels
 
 
-def cut_of(view: View, image: np.ndarray, labels: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndarray, ...]:
+def cut_of(view: CropWindow, image: np.ndarray, labels: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndarray, ...]:
     return tuple(map(np.asarray, fast_cut(view, image, labels, np.array(size_px, np.int32))))
 
 
@@ -67,7 +79,7 @@ def lit(*words: tuple) -> tuple[np.ndarray, np.ndarray]:
 
 
 def coded(size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """An image in bands of flat colour that tell the label: red is 50 for each label."""
+    """An image in bands of flat colour by label: red is 50 for each label."""
     rows, columns = np.indices(STORED_PX)
     labels = ((rows // 4 + columns // 5) % 4).astype(np.uint8)
     labels[size_px[0] :], labels[:, size_px[1] :] = 99, 99
@@ -158,8 +170,8 @@ def test_colours_stay_on_their_labels(size_px, scale, offset_px, mirrored):
 
 
 @given(sizes, st.tuples(st.integers(1, 40), st.integers(1, 40)))
-def test_the_whole_view_shows_the_whole_image_in_the_middle(size_px, crop_px):
-    view = whole_view(np.array(size_px), crop_px)
+def test_the_whole_window_shows_the_whole_image_in_the_middle(size_px, crop_px):
+    view = whole_window(np.array(size_px), crop_px)
     assume(min(size_px) * float(view.scale) >= 1)
     lying = [
         np.array([reference_augment.position(i, int(view.offset_px[axis]), float(view.scale), size_px[axis], False)
@@ -193,10 +205,10 @@ def test_draws_reach_all_that_they_may():
 
     @jax.jit
     @jax.vmap
-    def draw(key: jax.Array) -> tuple[View, View]:
+    def draw(key: jax.Array) -> tuple[CropWindow, CropWindow]:
         size_px, labels = jnp.array([24, 30]), jnp.zeros((24, 30), jnp.uint8)
         still = replace(OPTIONS, mirror=False)
-        return draw_view(key, labels, size_px, fixed), draw_view(key, labels, size_px, still)
+        return draw_window(key, labels, size_px, fixed), draw_window(key, labels, size_px, still)
 
     views, never = draw(jax.random.split(jax.random.key(0), 400))
     assert set(views.offset_px[:, 0].tolist()) == set(range(24 - CROP_PX[0] + 1))
@@ -220,27 +232,22 @@ def test_drawn_pixels_are_of_all_classes_of_the_image_evenly(size_px, seed):
 
 def test_a_pixel_of_an_image_without_labels_is_its_first():
     labels = np.full(STORED_PX, IGNORE, np.uint8)
-    rows, columns = draw_pixels(jax.random.split(jax.random.key(0), 2), labels, np.array(STORED_PX))
+    rows, columns = draw_pixels(jax.random.split(jax.random.key(0), 400), labels, np.array(STORED_PX))
     assert not rows.any() and not columns.any()
 
 
 def test_crops_around_classes_hold_what_is_rare():
-    labels = np.zeros((64, 80), np.uint8)
-    labels[50, 7] = 2
+    labels = jnp.zeros((64, 80), jnp.uint8).at[50, 7].set(2)
     size_px, enlarged = np.array(labels.shape), replace(OPTIONS, scale=(1.0, 2.0))
 
     def held(class_share: float) -> float:
-        draw = partial(draw_view, options=replace(enlarged, class_share=class_share))
-        views = jax.jit(jax.vmap(draw, in_axes=(0, None, None)))(
-            jax.random.split(jax.random.key(1), 300), labels, size_px
-        )
-        crops = (
-            cut_of(
-                jax.tree.map(lambda leaf, i=i: leaf[i], views), np.zeros((*labels.shape, 3), np.uint8), labels, size_px
-            )
-            for i in range(300)
-        )
-        return float(np.mean([(near == 2).any() for _, near in crops]))
+        @jax.jit
+        @jax.vmap
+        def rare(key: jax.Array) -> jax.Array:
+            window = draw_window(key, labels, size_px, replace(enlarged, class_share=class_share))
+            return (cut_nearest(window, labels, size_px, CROP_PX, IGNORE) == 2).any()
+
+        return float(rare(jax.random.split(jax.random.key(1), 300)).mean())
 
     assert held(0.0) < 0.15
     assert 0.4 < held(1.0) < 0.65, "one of two classes is chosen"

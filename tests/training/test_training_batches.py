@@ -10,23 +10,26 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_training import compiled_quickly
 from training_data import CLASSES, scene, write_pair
 
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import IGNORE
 from jaxmap.training.augment import augment
-from jaxmap.training.batches import Order, Pixels, batches_from
+from jaxmap.training.batches import ExampleOrder, ExampleReader, batches_from
 from jaxmap.training.data import TrainingSet, open_training_set
-from jaxmap.training.options import AugmentationOptions, TrainingOptions
+from jaxmap.training.options import AugmentationOptions, DataOptions, TrainingOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 SIZES_PX = ((20, 30), (25, 17), (16, 16))
 
 
-def order_of(images: int, epochs: int, batch: int, copies: int | None = None, seed: int = 0) -> Order:
+def order_of(images: int, epochs: int, batch: int, copies: int | None = None, seed: int = 0) -> ExampleOrder:
     options = TrainingOptions(
         epochs=epochs, batch_size=batch, seed=seed, augmentation=AugmentationOptions(crop_px=(16, 16), copies=copies)
     )
-    return Order.of(images, options)
+    return ExampleOrder.of(images, options)
 
 
 orders = st.builds(
@@ -45,12 +48,12 @@ def opened(tmp_path_factory) -> TrainingSet:
     folder = tmp_path_factory.mktemp("data")
     for index, size_px in enumerate(SIZES_PX):
         write_pair(folder, f"i{index}", *scene(size_px, index))
-    return open_training_set(folder, CLASSES, validation_share=0)
+    return open_training_set(folder, CLASSES, DataOptions(validation_share=0))
 
 
 @pytest.fixture(scope="module")
-def pixels(opened) -> Pixels:
-    return Pixels(opened.train, opened.lookup)
+def pixels(opened) -> ExampleReader:
+    return ExampleReader(opened.train, opened.lookup)
 
 
 @given(orders)
@@ -77,7 +80,7 @@ def test_epochs_follow_without_a_gap(order):
 
 @given(orders, st.integers(0, 100))
 def test_any_step_can_be_asked_for(order, step):
-    np.testing.assert_array_equal(order.draws(step), Order(*order).draws(step))
+    np.testing.assert_array_equal(order.draws(step), ExampleOrder(*order).draws(step))
 
 
 def test_epochs_and_seeds_have_orders_of_their_own():
@@ -115,14 +118,14 @@ def test_batches_from_a_step_on_are_those_of_the_whole(pixels, first):
 
 def test_a_cache_that_is_full_changes_nothing(opened, pixels):
     order = order_of(3, 2, 4)
-    small = Pixels(opened.train, opened.lookup, cache_bytes=2500)
+    small = ExampleReader(opened.train, opened.lookup, cache_bytes=2500)
     for step in range(order.steps):
         for ours, expected in zip(*(reader.batch(order.draws(step), order) for reader in (small, pixels)), strict=True):
             np.testing.assert_array_equal(ours, expected)
     assert sum(array.nbytes for pair in small._kept.values() for array in pair) <= 2500
 
 
-def crops_of(pixels: Pixels, order: Order) -> dict[tuple[int, int], np.ndarray]:
+def crops_of(pixels: ExampleReader, order: ExampleOrder) -> dict[tuple[int, int], np.ndarray]:
     """The crop drawn for each (epoch, example), as the step draws it."""
     fill, key = (0.0, 0.0, 0.0), jax.random.key(3)
 
@@ -156,7 +159,7 @@ def test_without_copies_each_epoch_draws_anew(pixels):
     assert not any(np.array_equal(crops[0, example], crops[1, example]) for example in range(3))
 
 
-def test_an_image_that_is_gone_is_told(opened, tmp_path):
+def test_an_image_that_is_gone_is_reported(opened, tmp_path):
     lost = opened.train[0]._replace(image=Path(tmp_path / "gone.png"))
     with pytest.raises(JaxmapError, match=r"gone\.png"):
-        list(batches_from(Pixels((lost,), opened.lookup), order_of(1, 1, 1), 0))
+        list(batches_from(ExampleReader((lost,), opened.lookup), order_of(1, 1, 1), 0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 
 import pytest
 import yaml
@@ -12,21 +12,15 @@ from hypothesis import strategies as st
 
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import config_folder
-from jaxmap.runs.training_plan import (
-    DataConfig,
-    MapTruthConfig,
-    TrainConfig,
-    check_train_config,
-    load_train_config,
-    train_config_tree,
-)
-from jaxmap.training.batches import Order
+from jaxmap.runs.training_plan import TRAIN_SETTINGS, MapTruthOptions, TrainConfig
+from jaxmap.training.batches import ExampleOrder
 from jaxmap.training.options import (
     AugmentationOptions,
-    LossOptions,
+    BatchNormOptions,
+    DataOptions,
     NetworkOptions,
-    NormOptions,
     OptimiserOptions,
+    PixelLossOptions,
     TrainingOptions,
 )
 
@@ -36,8 +30,8 @@ SECTIONS = ("augmentation", "loss", "optimiser", "norm", "data", "network", "map
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_every_config_loads_and_is_read_to_the_last_key(path):
-    config = load_train_config(str(path))
-    assert config == load_train_config(path.stem) == load_train_config(path.name)
+    config = TRAIN_SETTINGS.load(str(path))
+    assert config == TRAIN_SETTINGS.load(path.stem) == TRAIN_SETTINGS.load(path.name)
 
     def check(part: dict, whole: dict) -> None:
         for key, value in part.items():
@@ -46,13 +40,13 @@ def test_every_config_loads_and_is_read_to_the_last_key(path):
             else:
                 assert whole[key] == value, key
 
-    check(yaml.safe_load(path.read_text()), train_config_tree(config))
+    check(yaml.safe_load(path.read_text()), TRAIN_SETTINGS.tree(config))
     assert path.read_text().startswith("#"), "says what it is"
 
 
 def test_the_paper_makes_four_hundred_of_fifty():
-    config = load_train_config("chiodini2020")
-    order = Order.of(50, config)
+    config = TRAIN_SETTINGS.load("chiodini2020")
+    order = ExampleOrder.of(50, config)
     assert order.examples == 400 and order.variants == 8
     assert config.classes == ("background", "sand", "rock") and config.augmentation.mirror
 
@@ -71,15 +65,15 @@ configs = st.builds(
         hue_rad=st.floats(0, 3),
     ),
     loss=st.builds(
-        LossOptions,
+        PixelLossOptions,
         lovasz=st.floats(0, 2),
         class_weights=st.sampled_from(["equal", "balanced", (1.0, 2.5)]),
         label_smoothing=st.floats(0, 1, exclude_max=True),
     ),
     optimiser=st.builds(OptimiserOptions, kind=st.sampled_from(["adamw", "sgd"]), clip_norm=st.none() | st.just(2.0)),
-    norm=st.builds(NormOptions, head=st.sampled_from(["auto", "batch", "frozen"])),
+    norm=st.builds(BatchNormOptions, head=st.sampled_from(["auto", "batch", "frozen"])),
     data=st.builds(
-        DataConfig,
+        DataOptions,
         remap=st.none() | st.just({"255": "rock", "*": "sand"}),
         palette=st.none() | st.just({"rock": "#ff0000 #00ff00"}),
     ),
@@ -94,24 +88,26 @@ configs = st.builds(
 
 @given(configs)
 def test_a_config_comes_back_from_its_tree_and_from_yaml(config):
-    tree = train_config_tree(config)
-    assert check_train_config(tree) == config
-    assert check_train_config(yaml.safe_load(yaml.safe_dump(tree))) == config
-    assert train_config_tree(check_train_config(tree)) == tree
+    tree = TRAIN_SETTINGS.tree(config)
+    assert TRAIN_SETTINGS.check(tree) == config
+    assert TRAIN_SETTINGS.check(yaml.safe_load(yaml.safe_dump(tree))) == config
+    assert TRAIN_SETTINGS.tree(TRAIN_SETTINGS.check(tree)) == tree
 
 
 def test_the_settings_of_a_run_can_be_read_again(tmp_path):
     """A run's config.yaml names its data and its start as well, which are not settings."""
-    tree = {"training_data": "somewhere", "init": None, **train_config_tree(TrainConfig(epochs=7))}
+    tree = {"training_data": "somewhere", "init": None, **TRAIN_SETTINGS.tree(TrainConfig(epochs=7))}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(tree))
-    assert load_train_config(str(tmp_path / "config.yaml")) == TrainConfig(epochs=7)
+    assert TRAIN_SETTINGS.load(str(tmp_path / "config.yaml")) == TrainConfig(epochs=7)
 
 
 @pytest.mark.parametrize(
     "kind",
-    [TrainConfig, TrainingOptions, AugmentationOptions, LossOptions, OptimiserOptions, NormOptions, DataConfig,
-     NetworkOptions, MapTruthConfig],
-)  # fmt: skip
+    [
+        *(TrainConfig, TrainingOptions, AugmentationOptions, PixelLossOptions, OptimiserOptions, BatchNormOptions),
+        *(DataOptions, NetworkOptions, MapTruthOptions),
+    ],
+)
 def test_every_setting_has_a_default_and_says_what_it_is(kind):
     assert is_dataclass(kind) and kind() == kind()
     source = inspect.getsource(kind).splitlines()
@@ -149,12 +145,32 @@ def test_every_setting_has_a_default_and_says_what_it_is(kind):
 )
 def test_every_fault_is_named_by_its_key(tree, named):
     with pytest.raises(UsageError) as caught:
-        check_train_config(tree, where="mine.yaml")
+        TRAIN_SETTINGS.check(tree, where="mine.yaml")
     assert all(part in str(caught.value) for part in named), str(caught.value)
     assert "mine.yaml" in str(caught.value)
 
 
-def test_options_go_before_the_config(tmp_path):
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: AugmentationOptions(scale=(2, 1)), "augmentation.scale is 2.0 1.0"),
+        (lambda: AugmentationOptions(crop_px=(8, 384)), "augmentation.crop_px.0 is 8"),
+        (lambda: PixelLossOptions(cross_entropy=0), "every loss has a weight of 0"),
+        (lambda: OptimiserOptions(learning_rate=-1, momentum=2), "optimiser.learning_rate is -1"),
+        (lambda: OptimiserOptions(learning_rate=-1, momentum=2), "optimiser.momentum is 2"),
+        (lambda: DataOptions(validation_share=1), "data.validation_share is 1"),
+        (lambda: TrainConfig(epochs=0), "epochs is 0"),
+        (lambda: TrainConfig(epoch=1), "unknown key epoch"),
+        (lambda: replace(TrainConfig(), keep="first"), "keep is 'first'"),
+    ],
+)
+def test_options_are_validated_when_they_are_made(make, named):
+    with pytest.raises(UsageError) as caught:
+        make()
+    assert named in str(caught.value)
+
+
+def test_options_override_the_config(tmp_path):
     from jaxmap.commands.console import parse
     from jaxmap.commands.train import TrainArguments, _with_config
 
@@ -166,5 +182,5 @@ def test_options_go_before_the_config(tmp_path):
 def test_yaml_runs_no_code(tmp_path):
     (tmp_path / "evil.yaml").write_text("!!python/object/apply:os.mkdir ['" + str(tmp_path / "made") + "']\n")
     with pytest.raises(UsageError, match=r"evil\.yaml"):
-        load_train_config(str(tmp_path / "evil.yaml"))
+        TRAIN_SETTINGS.load(str(tmp_path / "evil.yaml"))
     assert not (tmp_path / "made").exists()

@@ -13,9 +13,9 @@ from PIL import Image
 
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.labels import IGNORE
-from jaxmap.training.data import check_training_set, digest, open_training_set, read_example
+from jaxmap.training.data import check_training_set, digest, open_training_set, read_example, split_names
 from jaxmap.training.masks import UNNAMED, make_mask_lookup, read_labels
-from jaxmap.training.splits import split_names
+from jaxmap.training.options import DataOptions
 
 CLASSES = ("sand", "rock")
 NAMES = ("a", "b", "c", "deep/d", "deep/e")
@@ -54,7 +54,7 @@ def lists(folder: Path, train: str | None = None, validation: str | None = None)
 
 def error_of(folder: Path, classes=CLASSES, *, check: bool = True, **options) -> str:
     with pytest.raises(JaxmapError) as caught:
-        opened = open_training_set(folder, classes, **options)
+        opened = open_training_set(folder, classes, DataOptions(**options))
         if check:
             check_training_set(opened)
     return str(caught.value).replace(str(folder), "SET")
@@ -86,7 +86,7 @@ def test_one_list_leaves_the_rest_to_the_other_part(folder) -> None:
 
 
 def test_sizes_are_height_and_width_of_the_headers(folder) -> None:
-    opened = open_training_set(folder, CLASSES, validation_share=0)
+    opened = open_training_set(folder, CLASSES, DataOptions(validation_share=0))
     assert [example.size_px for example in opened.train] == [(12 + index, 20) for index in range(5)]
     assert opened.validation == () and opened.notes == ("no image validates",)
 
@@ -171,7 +171,7 @@ def test_colours_are_looked_up_one_by_one(tmp_path_factory, colours, seed) -> No
         name: " ".join("#{:02x}{:02x}{:02X}".format(*key) for key, own in meanings.items() if own == name)
         for name in classes
     }
-    palette["ignore"] = colours[3] if len(colours) < 8 else "*"
+    palette["ignore"] = "#{:02x}{:02x}{:02x}".format(*colours[3]) if len(colours) < 8 else "*"
     write_mask(path := tmp_path_factory.mktemp("mask") / "m.png", pixels)
     labels = read_labels(path, make_mask_lookup(classes, None, palette))
     np.testing.assert_array_equal(labels, slow_labels(pixels, meanings, classes))
@@ -204,7 +204,7 @@ def test_a_palette_image_is_looked_up_by_its_colours_too(tmp_path) -> None:
     image = Image.fromarray(np.array([[0, 1], [1, 0]], np.uint8))
     image.putpalette([9, 9, 9, 200, 3, 3])
     image.save(tmp_path / "m.png")
-    lookup = make_mask_lookup(CLASSES, None, {"sand": (200, 3, 3), "rock": "#090909"})
+    lookup = make_mask_lookup(CLASSES, None, {"sand": "#c80303", "rock": "#090909"})
     np.testing.assert_array_equal(read_labels(tmp_path / "m.png", lookup), [[1, 0], [0, 1]])
 
 
@@ -213,7 +213,7 @@ def test_a_palette_image_is_looked_up_by_its_colours_too(tmp_path) -> None:
 
 def test_examples_are_rgb_and_labels(folder) -> None:
     write_mask(folder / "images/a.jpg", np.full((12, 20), 90, np.uint8))
-    opened = open_training_set(folder, CLASSES, validation_share=0)
+    opened = open_training_set(folder, CLASSES, DataOptions(validation_share=0))
     image, labels = read_example(opened.train[0], opened.lookup)
     assert image.shape == (12, 20, 3) and image.dtype == np.uint8 and image.flags.c_contiguous
     assert (image == 90).all()
@@ -224,15 +224,14 @@ def test_a_turned_photograph_stays_as_stored(folder) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.new("RGB", (20, 12), (1, 2, 3)).save(folder / "images/a.jpg", exif=exif)
-    opened = open_training_set(folder, CLASSES, validation_share=0)
+    opened = open_training_set(folder, CLASSES, DataOptions(validation_share=0))
     assert read_example(opened.train[0], opened.lookup)[0].shape == (12, 20, 3)
 
 
 def test_the_check_counts_every_pixel_once(folder) -> None:
     lists(folder, "a\nb\nc\n")
-    opened, told = open_training_set(folder, CLASSES), []
-    counts = check_training_set(opened, told.append)
-    assert told == [1, 2, 3, 4, 5]
+    opened = open_training_set(folder, CLASSES)
+    counts = check_training_set(opened)
     assert counts.dtype == np.int64
     for row, part in enumerate((opened.train, opened.validation)):
         labels = np.concatenate([read_example(example, opened.lookup)[1].ravel() for example in part])
@@ -248,7 +247,7 @@ def test_a_class_that_only_validation_lacks_is_no_fault(folder) -> None:
 
 def test_the_digest_knows_what_a_resumed_run_must_share(folder, tmp_path) -> None:
     def of(place: Path, classes=CLASSES, **options) -> str:
-        return digest(open_training_set(place, classes, **options))
+        return digest(open_training_set(place, classes, DataOptions(**options)))
 
     first = of(folder)
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))
@@ -271,7 +270,7 @@ def test_the_digest_knows_what_a_resumed_run_must_share(folder, tmp_path) -> Non
 PARTNERS = "each images/NAME needs a masks/NAME.png, each name stands once in train.txt or val.txt"
 
 
-def test_names_that_do_not_fit_are_told_together(folder) -> None:
+def test_names_that_do_not_fit_are_reported_together(folder) -> None:
     shutil.copy(folder / "images/a.jpg", folder / "images/a.jpeg")
     (folder / "masks/b.png").unlink()
     write_mask(folder / "masks/z.png", np.zeros((3, 3), np.uint8))
@@ -382,12 +381,12 @@ FAULTY_FILES = [
 )
 def test_faulty_files(folder, file, damage, expected) -> None:
     damage(folder / file)
-    told = error_of(folder)
+    error = error_of(folder)
     before, _, after = expected.partition(".*")
-    assert told.startswith(before) and told.endswith(after)
+    assert error.startswith(before) and error.endswith(after)
 
 
-def test_faulty_files_are_told_together(folder) -> None:
+def test_faulty_files_are_reported_together(folder) -> None:
     for name in ("a", "c", "deep/d"):
         big(folder / f"masks/{name}.png")
     assert error_of(folder, validation_share=0) == (
@@ -396,8 +395,8 @@ def test_faulty_files_are_told_together(folder) -> None:
     )
 
 
-def test_reading_tells_of_the_file_and_its_values(folder) -> None:
-    opened = open_training_set(folder, CLASSES, validation_share=0)
+def test_reading_names_the_file_and_its_values(folder) -> None:
+    opened = open_training_set(folder, CLASSES, DataOptions(validation_share=0))
     mask = np.zeros((12, 20), np.uint8)
     mask[0, :3] = (7, 2, 200)
     write_mask(folder / "masks/a.png", mask)
@@ -413,7 +412,7 @@ def test_reading_tells_of_the_file_and_its_values(folder) -> None:
         read_example(opened.train[0], opened.lookup)
 
 
-def test_binary_masks_of_0_and_255_are_told_how_to_be_read(folder) -> None:
+def test_errors_say_how_binary_masks_of_0_and_255_are_read(folder) -> None:
     for name in NAMES:
         path = folder / f"masks/{name}.png"
         write_mask(path, np.where(np.array(Image.open(path)) == 1, 255, 0).astype(np.uint8))
@@ -421,7 +420,7 @@ def test_binary_masks_of_0_and_255_are_told_how_to_be_read(folder) -> None:
         "no pixel of the training masks is rock; they hold 0 (sand), 255 (ignore) in SET/masks; "
         "if 255 stands for rock, say so: --data.remap 0 sand 255 rock"
     )
-    opened = open_training_set(folder, CLASSES, remap={"0": "sand", "255": "rock"})
+    opened = open_training_set(folder, CLASSES, DataOptions(remap={"0": "sand", "255": "rock"}))
     assert (check_training_set(opened).sum(axis=0) > 0).all()
 
 
@@ -452,29 +451,29 @@ WRONG_OPTIONS = [
         "unknown class stone in --data.remap; the classes are sand, rock, and ignore",
     ),
     (dict(remap={"x": "sand"}), "'x' is no value of a mask in --data.remap; give 0 to 65535, or \"*\""),
-    (dict(remap={-1: "sand"}), '-1 is no value of a mask in --data.remap; give 0 to 65535, or "*"'),
-    (dict(remap={65536: "sand"}), '65536 is no value of a mask in --data.remap; give 0 to 65535, or "*"'),
+    (dict(remap={-1: "sand"}), "'-1' is no value of a mask in --data.remap; give 0 to 65535, or \"*\""),
+    (dict(remap={65536: "sand"}), "'65536' is no value of a mask in --data.remap; give 0 to 65535, or \"*\""),
     (dict(remap={1: "sand", "01": "rock"}), "two classes for the value 01 in --data.remap; name it once"),
     (
         dict(remap={1: "sand"}, palette={"sand": "#000000"}),
         "masks have either values or colours in --data.palette; leave out --data.remap",
     ),
-    (
-        dict(palette={"sand": "red"}),
-        "'red' is no colour in --data.palette; give #rrggbb, or three numbers from 0 to 255",
-    ),
+    (dict(palette={"sand": "red"}), "'red' is no colour in --data.palette; give #rrggbb"),
     (
         dict(palette={"sand": (0, 0, 256)}),
-        "(0, 0, 256) is no colour in --data.palette; give #rrggbb, or three numbers from 0 to 255",
+        "data.palette.sand is (0, 0, 256): input should be a valid string; choose a valid value",
     ),
     (
-        dict(palette={"sand": "#000000", "rock": (0, 0, 0)}),
-        "sand and rock share #000000 in --data.palette; a colour is one class's",
+        dict(palette={"sand": "#00000f", "rock": "#00000F"}),
+        "sand and rock share #00000f in --data.palette; a colour is one class's",
     ),
     (dict(palette={"sand": "*", "rock": "*"}), '"*" is given to sand and rock in --data.palette; give it to one'),
     (dict(palette={"sand": "#000000"}), "nothing stands for rock in --data.palette; name every class"),
-    (dict(validation_share=1.0), "a share of 1.0 in --data.validation-share; give 0 to below 1"),
-    (dict(validation_share=float("nan")), "a share of nan in --data.validation-share; give 0 to below 1"),
+    (dict(validation_share=1.0), "data.validation_share is 1.0: input should be less than 1; choose a valid value"),
+    (
+        dict(validation_share=float("nan")),
+        "data.validation_share is nan: input should be a finite number; choose a valid value",
+    ),
     (dict(classes=()), "faulty classes (none) in --classes; give 1 to 254 different names"),
     (dict(classes=("a", "a")), "faulty classes a, a in --classes; give 1 to 254 different names"),
     (dict(classes=("a", "ignore")), "no class can be called ignore in --classes; name it otherwise"),
@@ -484,9 +483,9 @@ WRONG_OPTIONS = [
 @pytest.mark.parametrize(
     ("options", "expected"), WRONG_OPTIONS, ids=[text.split(" in ")[0] for _, text in WRONG_OPTIONS]
 )
-def test_wrong_options_are_told(folder, options, expected) -> None:
+def test_wrong_options_are_reported(folder, options, expected) -> None:
     with pytest.raises(UsageError) as caught:
-        open_training_set(folder, **{"classes": CLASSES, **options})
+        open_training_set(folder, options.pop("classes", CLASSES), DataOptions(**options))
     assert str(caught.value) == expected
 
 

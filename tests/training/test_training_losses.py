@@ -12,22 +12,25 @@ import pytest
 import reference_losses
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_training import compiled_quickly
 
 from jaxmap.errors import UsageError
 from jaxmap.labels import IGNORE
 from jaxmap.training.losses import class_weights, total_loss
-from jaxmap.training.options import LossOptions
+from jaxmap.training.options import PixelLossOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 PIXELS, CLASSES = 24, 3
 EQUAL = np.ones(CLASSES, np.float32)
 UNEQUAL = np.array([0.5, 0.7, 1.8], np.float32)
 
 OPTIONS = {
-    "cross_entropy": LossOptions(),
-    "smoothed": LossOptions(label_smoothing=0.2),
-    "soft_iou": LossOptions(cross_entropy=0, soft_iou=1),
-    "lovasz": LossOptions(cross_entropy=0, lovasz=1),
-    "all": LossOptions(cross_entropy=0.5, soft_iou=2, lovasz=0.25, label_smoothing=0.1),
+    "cross_entropy": PixelLossOptions(),
+    "smoothed": PixelLossOptions(label_smoothing=0.2),
+    "soft_iou": PixelLossOptions(cross_entropy=0, soft_iou=1),
+    "lovasz": PixelLossOptions(cross_entropy=0, lovasz=1),
+    "all": PixelLossOptions(cross_entropy=0.5, soft_iou=2, lovasz=0.25, label_smoothing=0.1),
 }
 LOSSES = {name: jax.jit(partial(total_loss, options=options)) for name, options in OPTIONS.items()}
 GRADIENTS = {name: jax.jit(jax.grad(partial(total_loss, options=options))) for name, options in OPTIONS.items()}
@@ -168,11 +171,11 @@ def test_the_weight_of_a_class_is_the_weight_of_its_pixels(seed):
 
 def test_weights_of_classes():
     pixels = np.array([900, 100, 0])
-    np.testing.assert_array_equal(class_weights(LossOptions(), pixels), [1, 1, 1])
-    balanced = class_weights(LossOptions(class_weights="balanced"), pixels[:2])
+    np.testing.assert_array_equal(class_weights(PixelLossOptions(), pixels), [1, 1, 1])
+    balanced = class_weights(PixelLossOptions(class_weights="balanced"), pixels[:2])
     assert balanced.mean() == pytest.approx(1) and balanced[1] / balanced[0] == pytest.approx(3)
-    assert np.isfinite(class_weights(LossOptions(class_weights="balanced"), pixels)).all()
-    own = class_weights(LossOptions(class_weights=(1.0, 2.0, 3.0)), pixels)
+    assert np.isfinite(class_weights(PixelLossOptions(class_weights="balanced"), pixels)).all()
+    own = class_weights(PixelLossOptions(class_weights=(1.0, 2.0, 3.0)), pixels)
     np.testing.assert_allclose(own, [0.5, 1, 1.5])
     with pytest.raises(UsageError, match="2 class weights for 3 classes"):
-        class_weights(LossOptions(class_weights=(1.0, 2.0)), pixels)
+        class_weights(PixelLossOptions(class_weights=(1.0, 2.0)), pixels)

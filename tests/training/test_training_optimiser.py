@@ -11,9 +11,12 @@ import optax
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_training import compiled_quickly
 
-from jaxmap.training.optimiser import is_statistic, make_optimiser, poly_rate, trained_names
 from jaxmap.training.options import OptimiserOptions
+from jaxmap.training.step import is_statistic, make_optimiser, poly_rate, trained_names
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 PLAIN = OptimiserOptions(learning_rate=0.1, warmup_steps=0, weight_decay=0.0, clip_norm=None)
 KINDS = ("adamw", "sgd")

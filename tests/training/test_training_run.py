@@ -1,4 +1,4 @@
-"""Training runs: what they write, and that cut off, refused or spoilt ones lose nothing."""
+"""Training runs: what they write, and that interrupted, refused or spoilt ones lose nothing."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -30,12 +31,14 @@ from tiny_training import (  # noqa: F401
 )
 from training_data import CLASSES, change_mask, scene, write_pair
 
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.models.checkpoint import load_network
-from jaxmap.runs.training import TrainingFolder, TrainingRun
-from jaxmap.runs.training_plan import TrainingPlan, load_train_config, plan_training
+from jaxmap.runs import training
+from jaxmap.runs.training import EpochMeter, TrainingFolder, TrainingRun
+from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainingPlan, plan_image_training
 from jaxmap.training.checkpoints import Checkpoints
-from jaxmap.training.step import StepInfo, TrainState
+from jaxmap.training.options import DataOptions
+from jaxmap.training.step import StepMetrics, TrainState
 
 OUTPUTS = {"model.safetensors", "history.csv", "metrics.json", "config.yaml", "report.html", "checkpoints"}
 TIMES = ("seconds", "images_per_s")
@@ -70,14 +73,21 @@ def same_run(run: Path, whole: Path) -> None:
     assert saved_steps(run) == saved_steps(whole)
 
 
-def planned(data: Path) -> TrainingPlan:
-    return plan_training(data, load_train_config(str(data / "tiny.yaml")), None, notify=lambda line: None)
+def planned(folder: Path, init: Path | None = None, **changes: object) -> TrainingPlan:
+    config = replace(TRAIN_SETTINGS.load(str(folder / "tiny.yaml")), **changes)
+    return plan_image_training(folder, config, init, notify=lambda line: None)
 
 
 @pytest.fixture(scope="module")
 def plan(tiny_data, shared_cache, network_is_tiny) -> TrainingPlan:
     """The plan of the whole run, whose step is compiled once for all that take it."""
     return planned(tiny_data)
+
+
+@pytest.fixture(autouse=True)
+def page_is_bare(monkeypatch):
+    """Pages take longer than tiny runs; that of `whole_run`, which is made before, is a real one."""
+    monkeypatch.setattr(training, "training_page", lambda record: f"{record.title}: {record.status}")
 
 
 @pytest.fixture
@@ -96,12 +106,30 @@ def nothing(steps: int, note: str) -> None:
     """Is done on a step."""
 
 
-def go(plan: TrainingPlan, out: Path, on_step: Callable[[int, str], None] = nothing, *, resume: bool = False) -> None:
-    """Trains into `out`, as the command does."""
+def go(
+    plan: TrainingPlan,
+    out: Path,
+    on_step: Callable[[int, str], None] = nothing,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> list[str]:
+    """Trains into `out`, as the command does; returns the lines for the user."""
     out.mkdir(exist_ok=True)
+    lines: list[str] = []
     folder = TrainingFolder(out)
-    folder.begin(plan, resume=resume, overwrite=False)
-    TrainingRun(plan, folder, notify=lambda line: None, on_step=on_step).run()
+    folder.begin(plan, resume=resume, overwrite=overwrite)
+    TrainingRun(plan, folder, notify=lines.append, on_step=on_step).run()
+    return lines
+
+
+def refused(plan: TrainingPlan, out: Path, kind: type[JaxmapError] = JaxmapError, **options: bool) -> str:
+    """The error of a run that may not begin or resume, which changes nothing."""
+    before = contents(out)
+    with pytest.raises(JaxmapError) as caught:
+        go(plan, out, **options)
+    assert type(caught.value) is kind and contents(out) == before
+    return str(caught.value)
 
 
 def run_until(plan: TrainingPlan, out: Path, step: int, *, resume: bool = False) -> None:
@@ -127,7 +155,7 @@ def test_a_run_writes_what_it_says(whole_run):
     assert metrics["examples_seen"] == 2 * STEPS and metrics["images"] == {"train": 5, "validation": 2}
     assert metrics["class_pixels"]["rock"]["train"] > 0
     assert metrics["kept_epoch"] == metrics["best"]["epoch"]
-    assert load_train_config(str(whole_run / "config.yaml")).batch_size == 2
+    assert TRAIN_SETTINGS.load(str(whole_run / "config.yaml")).batch_size == 2
 
 
 def test_the_history_is_complete(whole_run):
@@ -143,10 +171,10 @@ def test_the_history_is_complete(whole_run):
     assert float(history[-1]["val_loss"]) > 0
 
 
-def test_the_page_tells_the_run(whole_run):
+def test_the_page_shows_the_run(whole_run):
     page = (whole_run / "report.html").read_text()
     assert page.lower().startswith("<!doctype html>")
-    assert "tiny_data" in page and "random weights" in page and "data:image" in page
+    assert "tiny_data" in page and "Initial weights" in page and "data:image" in page
     assert "Stopped" not in page and "Interrupted" not in page
 
 
@@ -168,22 +196,20 @@ def test_no_time_is_counted_twice(plan, tmp_path):
     assert metrics_of(tmp_path / "run")["seconds"] == pytest.approx(sum(spent_s), abs=0.1)
 
 
-# --- cut off and gone on with
+# --- interrupted and resumed
 
 
 @pytest.mark.parametrize("step", [1, 4, STEPS])
-def test_a_cut_run_ends_as_if_it_had_not_been_cut(step, cli, plan, tiny_data, whole_run, tmp_path):
+def test_a_cut_run_ends_as_if_it_had_not_been_cut(step, plan, whole_run, tmp_path):
     run = tmp_path / "run"
     run_until(plan, run, step)
     assert saved_steps(run) == {1: [], 4: [3], STEPS: [3, 5]}[step]
-    if step == 4:
-        outcome = cli(*train_words(tiny_data, run, "--resume"))
-        assert outcome.status == 0 and f"going on after epoch 1 of {EPOCHS}" in outcome.err, outcome.err
-    else:
-        go(plan, run, resume=True)
+    lines = go(plan, run, resume=True)
+    assert (f"resuming after epoch 1 of {EPOCHS}" in lines) == (step == 4)
     same_run(run, whole_run)
 
 
+@pytest.mark.slow
 def test_a_run_may_be_cut_again_and_again(plan, whole_run, tmp_path):
     run_until(plan, tmp_path / "run", 4)
     run_until(plan, tmp_path / "run", 6, resume=True)
@@ -194,21 +220,22 @@ def test_a_run_may_be_cut_again_and_again(plan, whole_run, tmp_path):
 
 SLOWLY = """
 import sys, time
-from jaxmap.runs.training import Meter
+from jaxmap.runs.training import EpochMeter
 from tiny_training import main, tiny_network
 
-add = Meter.add
+add = EpochMeter.add
 def slowly(*words):
     time.sleep(0.3)
     return add(*words)
-Meter.add = slowly
+EpochMeter.add = slowly
 with tiny_network():
     sys.exit(main(sys.argv[1:]))
 """
 """Each step takes a while, so that the process dies in the middle of the run."""
 
 
-def test_a_killed_process_is_gone_on_with(plan, tiny_data, whole_run, tmp_path):
+@pytest.mark.slow
+def test_a_killed_process_is_resumed(plan, tiny_data, whole_run, tmp_path):
     run = tmp_path / "run"
     kill_when(lambda: saved_steps(run), SLOWLY, train_words(tiny_data, run))
     assert saved_steps(run)[-1] < STEPS
@@ -218,21 +245,24 @@ def test_a_killed_process_is_gone_on_with(plan, tiny_data, whole_run, tmp_path):
     assert all(path.name.isdecimal() for path in (run / "checkpoints").iterdir())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_is_one_line_and_says_how_to_go_on(number, cli, plan, tiny_data, whole_run, tmp_path, monkeypatch):
-    check = TrainingRun._check_finite
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+def test_an_interrupt_is_one_line_and_says_how_to_resume(
+    number, cli, plan, tiny_data, whole_run, tmp_path, monkeypatch
+):
+    steps, add = [], EpochMeter.add
 
-    def interrupted(self: TrainingRun, info: StepInfo, step: int, epoch: int) -> None:
-        check(self, info, step, epoch)
-        if step == 4:
+    def interrupted(self: EpochMeter, step: StepMetrics, images: int) -> str:
+        steps.append(step)
+        if len(steps) == 5:
             os.kill(os.getpid(), number)
+        return add(self, step, images)
 
     run = tmp_path / "run"
     # A shell in the background starts its children with interrupts ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with monkeypatch.context() as patched:
-            patched.setattr(TrainingRun, "_check_finite", interrupted)
+            patched.setattr(EpochMeter, "add", interrupted)
             outcome = cli(*train_words(tiny_data, run))
     finally:
         signal.signal(signal.SIGINT, before)
@@ -261,120 +291,109 @@ def test_resuming_in_an_empty_folder_starts(plan, whole_run, tmp_path):
 # --- refused
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("--epochs", "4"), "epochs"),
-        (("--optimiser.learning-rate", "0.01", "--seed", "1"), "optimiser.learning_rate, seed"),
-        (("--augmentation.no-mirror",), "augmentation.mirror"),
-    ],
-)
-def test_other_settings_are_refused_by_name(words, named, cli, tiny_data, run_copy):
-    before = contents(run_copy)
-    outcome = cli(*train_words(tiny_data, run_copy, "--resume", *words))
-    assert outcome.status == 2 and f"begun with another {named} " in outcome.error
-    assert contents(run_copy) == before
+def test_other_settings_are_refused_by_name(plan, run_copy):
+    config = plan.config
+    for changed, named in (
+        (replace(config, epochs=4), "epochs"),
+        (
+            replace(config, seed=1, optimiser=replace(config.optimiser, learning_rate=0.01)),
+            "optimiser.learning_rate, seed",
+        ),
+        (replace(config, augmentation=replace(config.augmentation, mirror=False)), "augmentation.mirror"),
+    ):
+        error = refused(plan._replace(config=changed), run_copy, UsageError, resume=True)
+        assert f"begun with another {named} " in error
 
 
-def test_other_data_are_refused(cli, data_copy, tiny_data, run_copy):
+def test_other_data_are_refused(data_copy, tiny_data, run_copy):
     settings = run_copy / "config.yaml"
     settings.write_text(settings.read_text().replace(str(tiny_data), str(data_copy)))
-    assert cli(*train_words(data_copy, run_copy, "--resume")).status == 0, "the same data in another place"
+    go(planned(data_copy), run_copy, resume=True)  # The same data in another place.
     change_mask(data_copy, "i2", lambda mask: np.where(mask == 1, 1, 0).astype(np.uint8))
-    before = contents(run_copy)
-    outcome = cli(*train_words(data_copy, run_copy, "--resume"))
-    assert outcome.status == 1 and "the training data have changed" in outcome.error
-    assert contents(run_copy) == before
+    assert "the training data have changed" in refused(planned(data_copy), run_copy, resume=True)
 
 
-def test_a_run_is_replaced_only_where_that_is_asked_for(cli, tiny_data, whole_run, run_copy):
+def test_a_run_is_replaced_only_where_that_is_asked_for(plan, whole_run, run_copy):
     (run_copy / "mine.txt").write_text("not the run's")
     (run_copy / "checkpoints" / "7").mkdir()
-    before = contents(run_copy)
-    outcome = cli(*train_words(tiny_data, run_copy))
-    assert outcome.status == 1 and "--resume" in outcome.error and "--overwrite" in outcome.error
-    assert contents(run_copy) == before
-    assert cli(*train_words(tiny_data, run_copy, "--overwrite")).status == 0
+    error = refused(plan, run_copy)
+    assert "--resume" in error and "--overwrite" in error
+    go(plan, run_copy, overwrite=True)
     same_run(run_copy, whole_run)
     assert (run_copy / "mine.txt").read_text() == "not the run's"
 
 
-def test_a_run_that_has_lost_its_checkpoints_keeps_its_model(cli, tiny_data, run_copy):
+def test_a_run_that_has_lost_its_checkpoints_keeps_its_model(plan, run_copy):
     """They are large, and a finished run is a run without them, too."""
     shutil.rmtree(run_copy / "checkpoints")
-    before = contents(run_copy)
-    for words in ((), ("--resume",)):
-        outcome = cli(*train_words(tiny_data, run_copy, *words))
-        assert outcome.status == 1 and "--overwrite" in outcome.error
-        assert contents(run_copy) == before
-    assert "lost its checkpoints" in outcome.error
+    assert "--overwrite" in refused(plan, run_copy)
+    error = refused(plan, run_copy, resume=True)
+    assert "--overwrite" in error and "lost its checkpoints" in error
 
 
-@pytest.mark.parametrize("words", [(), ("--overwrite",), ("--resume",)])
-def test_what_no_training_has_written_is_never_replaced(words, cli, tiny_data, tmp_path):
+@pytest.mark.parametrize("options", [{}, {"overwrite": True}, {"resume": True}])
+def test_files_that_no_training_has_written_are_never_replaced(options, plan, tmp_path):
     """A folder of another trainer's: it has settings and checkpoints as well."""
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)
     (run / "checkpoints" / "epoch7.pt").write_text("another's")
     (run / "config.yaml").write_text("model: unet\n")
-    before = contents(run)
-    outcome = cli(*train_words(tiny_data, run, *words))
-    assert outcome.status == 1 and "config.yaml, checkpoints would be replaced" in outcome.error
-    assert contents(run) == before
+    assert "config.yaml, checkpoints would be replaced" in refused(plan, run, **options)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "history.csv").write_text("another's")
+    assert "history.csv would be replaced" in refused(plan, tmp_path / "other", **options)
 
 
-def test_the_model_started_from_is_not_overwritten(cli, tiny_data, run_copy):
-    before = contents(run_copy)
-    outcome = cli(*train_words(tiny_data, run_copy, "--overwrite", "--init", run_copy / "model.safetensors"))
-    assert outcome.status == 1 and "an input would be overwritten" in outcome.error
-    assert contents(run_copy) == before
+def test_the_model_started_from_is_not_overwritten(plan, run_copy):
+    changed = plan._replace(init=run_copy / "model.safetensors")
+    assert "an input would be overwritten" in refused(changed, run_copy, overwrite=True)
 
 
-# --- other data and other starts
+# --- other data and other initial weights
 
 
-def test_a_run_goes_on_from_a_model(cli, tiny_data, whole_run, tmp_path):
-    outcome = cli(*train_words(tiny_data, tmp_path / "run", "--init", whole_run / "model.safetensors"))
-    assert outcome.status == 0, outcome.err
-    assert "fresh: nothing; batch norm learns in: nothing" in outcome.err
-    first = float(history_of(tmp_path / "run")[0]["train_loss"])
-    assert first < float(history_of(whole_run)[0]["train_loss"])
-    assert "model.safetensors" in (tmp_path / "run" / "report.html").read_text()
+def test_a_run_starts_from_a_model(tiny_data, whole_run):
+    plan = planned(tiny_data, whole_run / "model.safetensors")
+    assert plan.network.fresh == () and plan.network.batch_norms == ()
+    validator, best = plan.data.validator(plan.network.architecture), metrics_of(whole_run)["best"]
+    assert validator is not None
+    assert validator.score(plan.network.weights).summary["confusion"] == best["confusion"]
 
 
-def test_masks_of_validation_that_hold_nothing(cli, data_copy, tmp_path):
+def test_masks_of_validation_that_hold_nothing(plan, data_copy, tmp_path):
     """Nothing can be scored: the last weights are kept."""
     for name in ("i1", "i3"):
         change_mask(data_copy, name, lambda mask: np.full_like(mask, 255))
-    outcome = cli(*train_words(data_copy, tmp_path / "run"))
-    assert outcome.status == 0, outcome.err
-    assert "kept: epoch 3, mean IoU unknown" in outcome.err
-    assert metrics_of(tmp_path / "run")["best"]["mean_iou"] is None
+    go(plan._replace(data=planned(data_copy).data), tmp_path / "run")
+    metrics = metrics_of(tmp_path / "run")
+    assert metrics["kept_epoch"] == 3 and metrics["best"]["mean_iou"] is None
 
 
-def test_no_validation_at_all(cli, data_copy, tmp_path):
+def test_no_validation_at_all(plan, data_copy, tmp_path):
     for name in ("i1", "i3"):
         (data_copy / "images" / f"{name}.png").unlink()
         (data_copy / "masks" / f"{name}.png").unlink()
     (data_copy / "val.txt").unlink()
     write_pair(data_copy, "i2", *scene((36, 44), 2))
-    outcome = cli(*train_words(data_copy, tmp_path / "run", "--data.validation-share", "0"))
-    assert outcome.status == 0, outcome.err
+    data = planned(data_copy, data=DataOptions(validation_share=0)).data
+    assert len(data.names) == len(plan.data.names), "the order is the same"
+    go(plan._replace(data=data), tmp_path / "run")
     load_network(tmp_path / "run" / "model.safetensors")
     assert metrics_of(tmp_path / "run")["kept_epoch"] is None
 
 
-def test_fewer_examples_than_a_batch_holds(cli, data_copy, tmp_path):
+def test_fewer_examples_than_a_batch_holds(plan, data_copy, tmp_path):
     """Several epochs end in one step; each has its row, and the run is complete."""
     write_pair(data_copy, "only", *scene((40, 44), 0))
     (data_copy / "train.txt").write_text("only\n")
-    (data_copy / "tiny.yaml").write_text(CONFIG.replace("epochs: 3", "epochs: 16"))
-    outcome = cli(*train_words(data_copy, tmp_path / "run"))
-    assert outcome.status == 0, outcome.err
+    other = planned(data_copy, epochs=16, validate_every=16)
+    assert other.order.steps == plan.order.steps, "the schedule is the same"
+    plan = other._replace(trainer=plan.trainer)
+    go(plan, tmp_path / "run")
     history = history_of(tmp_path / "run")
     assert [int(row["step"]) for row in history] == [step for step in range(1, 9) for _ in range(2)]
     assert all(float(row["train_loss"]) > 0 for row in history)
-    assert "nothing is left to do" in cli(*train_words(data_copy, tmp_path / "run", "--resume")).err
+    assert go(plan, tmp_path / "run", resume=True)[-1] == "the run is complete; nothing is left to do"
 
 
 # --- what is not finite
@@ -383,7 +402,7 @@ def test_fewer_examples_than_a_batch_holds(cli, data_copy, tmp_path):
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_its_images(plan, whole_run, tmp_path):
     trained = plan.trainer.step
 
-    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepInfo]:
+    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepMetrics]:
         if int(state.step) != 6:
             return trained(state, batch, key)
         weights = {**state.weights, "classifier.bias": state.weights["classifier.bias"] * np.nan}
@@ -401,11 +420,12 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_its_images(plan, whol
     assert [row["epoch"] for row in history_of(run)] == ["1", "2"]
     assert "Stopped: loss nan" in (run / "report.html").read_text()
     assert not metrics_of(run)["complete"]
-    # What was kept is good: the run can go on from there.
+    # What was kept is good: the run can resume from there.
     go(plan, run, resume=True)
     same_run(run, whole_run)
 
 
+@pytest.mark.slow
 def test_a_rate_far_too_high_is_one_line(cli, tiny_data, tmp_path):
     words = ("--optimiser.learning-rate", "1e9", "--norm.head", "frozen", "--norm.backbone", "frozen")
     outcome = cli(*train_words(tiny_data, tmp_path / "run", *words, "--validate-every", "1"))
@@ -415,11 +435,11 @@ def test_a_rate_far_too_high_is_one_line(cli, tiny_data, tmp_path):
     assert "Stopped: " in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_an_answer_that_is_not_finite_in_validation_is_told(plan, tmp_path):
+def test_an_output_that_is_not_finite_in_validation_is_reported(plan, tmp_path):
     """Weights may be finite and still run over on an image that was not trained on."""
     trained = plan.trainer.step
 
-    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepInfo]:
+    def spoilt(state: TrainState, batch: object, key: jax.Array) -> tuple[TrainState, StepMetrics]:
         after, info = trained(state, batch, key)
         if int(after.step) != plan.order.epoch_end(min(plan.config.validate_every, plan.config.epochs) - 1):
             return after, info
@@ -440,19 +460,19 @@ def halve(folder: Path) -> None:
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(cli, tiny_data, whole_run, run_copy):
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(plan, whole_run, run_copy):
     halve(run_copy / "checkpoints" / str(STEPS))
-    outcome = cli(*train_words(tiny_data, run_copy, "--resume"))
-    assert outcome.status == 0 and f"going on after epoch 2 of {EPOCHS}" in outcome.err, outcome.err
+    assert f"resuming after epoch 2 of {EPOCHS}" in go(plan, run_copy, resume=True)
     same_run(run_copy, whole_run)
     # The damaged one has been replaced.
-    assert "nothing is left to do" in cli(*train_words(tiny_data, run_copy, "--resume")).err
+    assert go(plan, run_copy, resume=True)[-1] == "the run is complete; nothing is left to do"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fate", ["gone", "halved", "empty", "junk"])
 def test_no_damage_to_a_file_of_a_checkpoint_goes_unnoticed(fate, plan, whole_run, tmp_path):
     """The checkpoint before is read instead, or the very same values."""
-    like = plan.trainer.init(plan.start.weights)
+    like = plan.trainer.init(plan.network.weights)
     newest = whole_run / "checkpoints" / str(STEPS)
     whole = Checkpoints(whole_run / "checkpoints").restore(like)
     assert whole is not None and int(whole.state.step) == STEPS
@@ -475,16 +495,13 @@ def test_no_damage_to_a_file_of_a_checkpoint_goes_unnoticed(fate, plan, whole_ru
             assert int(found.state.step) == 5, path
 
 
-def test_where_all_are_damaged_it_is_told(cli, tiny_data, run_copy):
+def test_where_all_are_damaged_it_is_reported(plan, run_copy):
     halve(run_copy / "checkpoints")
-    before = contents(run_copy)
-    outcome = cli(*train_words(tiny_data, run_copy, "--resume"))
-    assert outcome.status == 1 and "no checkpoint can be read" in outcome.error
-    assert "--overwrite" in outcome.error and len(outcome.error) < 400
-    assert contents(run_copy) == before
+    error = refused(plan, run_copy, resume=True)
+    assert "no checkpoint can be read" in error and "--overwrite" in error and len(error) < 400
 
 
-def test_checkpoints_of_another_version_are_told(plan, tmp_path):
+def test_checkpoints_of_another_version_are_refused(plan, tmp_path):
     run_until(plan, tmp_path / "run", 4)
     record = next((tmp_path / "run" / "checkpoints").rglob("record/*"))
     tree = json.loads(record.read_text())
@@ -517,8 +534,8 @@ def small_disk(tmp_path):
     disk.unmount()
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5])
-def test_a_full_disk_is_one_line_and_the_run_goes_on_after_it(share, plan, whole_run, small_disk):
+@pytest.mark.parametrize("share", [pytest.param(0.2, marks=pytest.mark.slow), 0.5])
+def test_a_full_disk_is_one_line_and_the_run_is_resumed_after_it(share, plan, whole_run, small_disk):
     needed = sum(path.stat().st_blocks for path in whole_run.rglob("*")) // 2
     small_disk.mount(int(share * needed), MS_REMOUNT)
     run = small_disk.folder / "run"

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -19,8 +20,8 @@ from training_data import CLASSES, scene
 import jaxmap
 from jaxmap.models.deeplab import Weights, initial_weights, pure_network
 from jaxmap.training.augment import augment
-from jaxmap.training.options import AugmentationOptions, LossOptions, OptimiserOptions, TrainingOptions
-from jaxmap.training.step import Batch, StepInfo, Trainer, TrainState, make_trainer
+from jaxmap.training.options import AugmentationOptions, OptimiserOptions, PixelLossOptions, TrainingOptions
+from jaxmap.training.step import Batch, StepMetrics, Trainer, TrainState, make_trainer
 
 SIZE_PX = (32, 32)
 ALL_NORMS = ("backbone", "aspp", "decoder")
@@ -31,7 +32,7 @@ LEARNING = TrainingOptions(
 )
 FROZEN = replace(
     LEARNING,
-    loss=LossOptions(cross_entropy=0.5, soft_iou=1, lovasz=1),
+    loss=PixelLossOptions(cross_entropy=0.5, soft_iou=1, lovasz=1),
     optimiser=OptimiserOptions(kind="sgd", learning_rate=0.1, backbone_rate=0, warmup_steps=0, clip_norm=1.0),
 )
 DROPPING = replace(ARCHITECTURE, dropout=0.5)
@@ -47,12 +48,12 @@ class Compiled:
     def init(self, **changes: object) -> TrainState:
         return replace(self.trainer.init(self.weights), **changes)  # type: ignore[arg-type]
 
-    def step(self, state: TrainState, batch: Batch, key: int = 0) -> tuple[TrainState, StepInfo]:
+    def step(self, state: TrainState, batch: Batch, key: int = 0) -> tuple[TrainState, StepMetrics]:
         """One step, its arguments placed as in a run."""
         sharding = NamedSharding(Mesh(jax.local_devices(), ("data",)), PartitionSpec())
         return self.trainer.step(*jax.device_put((state, batch, jax.random.key(key)), sharding))
 
-    def run(self, steps: int, batch: Batch, key: int = 0) -> tuple[TrainState, list[StepInfo]]:
+    def run(self, steps: int, batch: Batch, key: int = 0) -> tuple[TrainState, list[StepMetrics]]:
         state, infos = self.init(), []
         for _ in range(steps):
             state, info = self.step(state, batch, key)
@@ -170,6 +171,7 @@ def test_the_average_runs_behind_the_weights(learning):
         np.testing.assert_allclose(state.average[name], mean, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_what_is_frozen_stays_to_the_last_bit(frozen):
     state, infos = frozen.run(5, batch_of(False))
     moved = {name for name, value in state.weights.items() if not np.array_equal(value, frozen.weights[name])}
@@ -180,6 +182,7 @@ def test_what_is_frozen_stays_to_the_last_bit(frozen):
     assert not any("backbone" in name for name in host(state) if ".optimiser" in name), "no moments for what is fixed"
 
 
+@pytest.mark.slow
 def test_dropout_differs_from_step_to_step(frozen):
     """With the rate at its end nothing moves, and only what is dropped changes the loss."""
     state, one = frozen.step(frozen.init(step=jnp.array(1000, jnp.int32)), batch_of())
@@ -192,21 +195,18 @@ def test_dropout_differs_from_step_to_step(frozen):
 
 def test_the_loss_of_a_step_is_that_of_its_examples(learning):
     batch = batch_of(False)
-    view_key, dropout_key = jax.random.split(jax.random.key(5))
+    augment_key, dropout_key = jax.random.split(jax.random.key(5))
     fill = tuple(255 * value for value in ARCHITECTURE.mean)
-    crops, labels = [], []
-    for place in range(2):
-        drawn = jax.random.fold_in(jax.random.fold_in(view_key, 0), place)
-        words = (batch.images[place], batch.labels[place], batch.sizes_px[place], jnp.array(False))
-        crop, near = augment(drawn, *words, LEARNING.augmentation, fill)
-        crops.append(crop)
-        labels.append(near)
+    draw = jax.jit(partial(augment, options=LEARNING.augmentation, fill=fill))
+    keys = [jax.random.fold_in(jax.random.fold_in(augment_key, 0), place) for place in range(2)]
+    drawn = [draw(key, *(array[place] for array in batch[:3]), jnp.array(False)) for place, key in enumerate(keys)]
+    crops, labels = zip(*drawn, strict=True)
     loss, (logits, _) = jax.jit(learning.trainer.loss)(
         learning.weights, jnp.stack(crops), jnp.stack(labels), dropout_key
     )
     _, info = learning.step(learning.init(), batch, key=5)
     assert float(info.loss) == pytest.approx(float(loss), rel=1e-3)
-    right = (np.asarray(logits).argmax(axis=-1) == labels)[np.array(labels) != 255]
+    right = (np.asarray(logits).argmax(axis=-1) == np.array(labels))[np.array(labels) != 255]
     assert float(info.accuracy) == pytest.approx(right.mean(), abs=0.01)
 
 

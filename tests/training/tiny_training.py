@@ -61,18 +61,27 @@ class TinyBackbone(nnx.Module):
 
 
 @contextmanager
-def tiny_network() -> Iterator[None]:
-    """Within it, `mobilenet_v2` names the tiny backbone, and what is compiled is not made fast."""
-    backbones: dict = deeplab._BACKBONES
-    before = backbones["mobilenet_v2"]
-    backbones["mobilenet_v2"] = TinyBackbone
-    deeplab.weight_shapes.cache_clear()
-    unhurried = jax.config.read(FLAG)
+def unoptimised() -> Iterator[None]:
+    """Within it, programs are compiled with few optimisations, which takes less time."""
+    before = jax.config.read(FLAG)
     jax.config.update(FLAG, True)
     try:
         yield
     finally:
-        jax.config.update(FLAG, unhurried)
+        jax.config.update(FLAG, before)
+
+
+@contextmanager
+def tiny_network() -> Iterator[None]:
+    """Within it, `mobilenet_v2` names the tiny backbone, and programs are compiled with few optimisations."""
+    backbones: dict = deeplab._BACKBONES
+    before = backbones["mobilenet_v2"]
+    backbones["mobilenet_v2"] = TinyBackbone
+    deeplab.weight_shapes.cache_clear()
+    try:
+        with unoptimised():
+            yield
+    finally:
         backbones["mobilenet_v2"] = before
         deeplab.weight_shapes.cache_clear()
 
@@ -81,6 +90,12 @@ def tiny_network() -> Iterator[None]:
 def network_is_tiny() -> Iterator[None]:
     """For all tests of the module that imports it."""
     with tiny_network():
+        yield
+
+
+def compiled_quickly() -> Iterator[None]:
+    """The fixture of modules with many programs that run once."""
+    with unoptimised():
         yield
 
 

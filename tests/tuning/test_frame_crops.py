@@ -14,7 +14,7 @@ from strategies import HEIGHT_PX, WIDTH_PX, disparities, rngs
 
 from jaxmap.geometry.camera import disparity_to_points, frustum_corners
 from jaxmap.labels import IGNORE
-from jaxmap.training.augment import View
+from jaxmap.training.augment import CropWindow as View
 from jaxmap.training.options import AugmentationOptions
 from jaxmap.tuning.frame_crops import FrameBatch, camera_of_view, crop_frame, points_per_pixel, widest_camera
 from jaxmap.types import make_stereo_camera

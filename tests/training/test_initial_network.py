@@ -7,13 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from golden.seeded_weights import seeded_weights
+from tiny_training import compiled_quickly
 
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import weight_shapes
-from jaxmap.training.options import NetworkOptions, NormOptions
-from jaxmap.training.starts import Start, make_start
+from jaxmap.training.initial_network import InitialNetwork, make_initial_network
+from jaxmap.training.options import BatchNormOptions, NetworkOptions
+
+quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
 CLASSES = ("background", "sand", "rock")
 SMALL = NetworkOptions(head_channels=8, low_level_channels=4, atrous_rates=(2,), top_conv=False)
@@ -34,11 +37,11 @@ def saved(architecture: Architecture = TRAINED, holds: str = "network") -> Saved
     return SavedModel(architecture, weights, holds)  # type: ignore[arg-type]
 
 
-def start_of(init: SavedModel | None, network: NetworkOptions = SMALL, classes=CLASSES, **norm: str) -> Start:
-    return make_start(network, NormOptions(**norm), classes, init, seed=1)  # type: ignore[arg-type]
+def start_of(init: SavedModel | None, network: NetworkOptions = SMALL, classes=CLASSES, **norm: str) -> InitialNetwork:
+    return make_initial_network(network, BatchNormOptions(**norm), classes, init, seed=1)  # type: ignore[arg-type]
 
 
-def kept(start: Start, init: SavedModel) -> set[str]:
+def kept(start: InitialNetwork, init: SavedModel) -> set[str]:
     """The blocks that hold the very weights of the file."""
     same = {
         name
@@ -58,7 +61,8 @@ def test_without_a_file_all_is_fresh_and_learns():
     assert start.batch_norms == ("backbone", "aspp", "decoder")
     assert {name: value.shape for name, value in start.weights.items()} == weight_shapes(start.architecture)
     again, other = (
-        make_start(SMALL, NormOptions(), CLASSES, None, seed=seed).weights["classifier.kernel"] for seed in (1, 2)
+        make_initial_network(SMALL, BatchNormOptions(), CLASSES, None, seed=seed).weights["classifier.kernel"]
+        for seed in (1, 2)
     )
     assert np.array_equal(start.weights["classifier.kernel"], again) and not np.array_equal(again, other)
 
@@ -148,7 +152,7 @@ def test_fresh_networks_see_at_several_scales_in_either_family(stride, rates):
         ({"backbone": "frozen", "head": "batch"}, ("aspp", "decoder")),
     ],
 )
-def test_norms_learn_where_they_are_told_to(norm, expected):
+def test_norms_train_as_the_options_say(norm, expected):
     assert start_of(saved(holds="backbone"), **norm).batch_norms == expected
 
 
