@@ -29,14 +29,14 @@ from jaxmap.evaluation.evaluate import ScoringOptions, evaluate_map
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.mapping.sequence import prepare_frames, run_sequence
+from jaxmap.refinement.frames import pinhole
+from jaxmap.refinement.refine import GroundReference, Refinement, refine
 from jaxmap.refinement.rig import vehicle_axes
-from jaxmap.refinement.rounds import Ground, Refinement, refine
-from jaxmap.refinement.solve import Prior
-from jaxmap.refinement.views import pinhole
+from jaxmap.refinement.solver import Prior
 from jaxmap.runs.config import DepthConfig, MapConfig
 from jaxmap.runs.evaluation import TruthOptions, class_map_of, read_truth
 from jaxmap.runs.mapping_plan import plan_run
-from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, ground_of, read_inputs
+from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, read_ground, read_inputs
 
 POSITION_M, ANGLE_RAD = 0.2, np.radians(1.0)
 PITCH_RAD, HEIGHT_M = np.radians(2.0), 0.1
@@ -56,7 +56,7 @@ def disturbed(T: np.ndarray, seed: int) -> np.ndarray:
 def mounted_wrong(T: np.ndarray, seed: int) -> np.ndarray:
     """All cameras pitched by 2 degrees and 0.1 m too high or too low."""
     pitch, height = np.random.default_rng(seed).choice([-1, 1], 2)
-    R = vehicle_axes(T).R_vehicle_camera
+    R = vehicle_axes(T)
     D = np.eye(4)
     D[:3, :3] = R.T @ Rotation.from_rotvec([0, pitch * PITCH_RAD, 0]).as_matrix() @ R
     D[:3, 3] = R.T @ [0, 0, height * HEIGHT_M]
@@ -95,12 +95,12 @@ def mounting_errors(T: np.ndarray, T_true: np.ndarray) -> str:
     return f"roll {turn[0]:.3f} pitch {turn[1]:.3f} heading {turn[2]:.3f} deg; height {way[2]:.2f} cm"
 
 
-def refined(inputs: RefineInputs, T: np.ndarray, prior: Prior, ground: Ground) -> tuple[Refinement, float]:
+def refined(inputs: RefineInputs, T: np.ndarray, prior: Prior, ground: GroundReference) -> tuple[Refinement, float]:
     """Refines poses of the rectified camera; and the seconds that took."""
     camera = inputs.front_end.camera
     depth_range_m = (0.3, usable_depth(camera, DEPTH_SIGMA_M, 0.5))
     started_s = time.perf_counter()
-    return refine(inputs.views, T, pinhole(camera), prior, ground, depth_range_m), time.perf_counter() - started_s
+    return refine(inputs.frames, T, pinhole(camera), prior, ground, depth_range_m), time.perf_counter() - started_s
 
 
 class Scorer:
@@ -137,11 +137,11 @@ class Scorer:
 def grounds(given: argparse.Namespace, inputs: RefineInputs) -> dict[str, Ground]:
     """What refinement is told of the ground: nothing, labels, an elevation model."""
     depth_m = usable_depth(inputs.front_end.camera, DEPTH_SIGMA_M, 0.5)
-    found = {"images alone": Ground()}
+    found = {"images alone": GroundReference()}
     if given.truth:
-        found["with labelled rocks"] = ground_of(GroundFiles(truth=(given.truth,)), inputs, depth_m)[0]
+        found["with labelled rocks"] = read_ground(GroundFiles(truth=(given.truth,)), inputs, depth_m)[0]
     if given.dem:
-        found["with elevation model"] = ground_of(GroundFiles(heights=given.dem), inputs, depth_m)[0]
+        found["with elevation model"] = read_ground(GroundFiles(heights=given.dem), inputs, depth_m)[0]
     return found
 
 

@@ -95,7 +95,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.datasets.label_coding import choose_coding
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.runs.evaluation import TruthOptions
-    from jaxmap.runs.refinement import CALIBRATION, OUTPUTS, GroundFiles, check_apart, run_refine
+    from jaxmap.runs.refinement import CALIBRATION, OUTPUTS, GroundFiles, check_inputs_apart, run_refine
 
     keep_compiled_programs()
     # What ends a job is told like Ctrl-C; the best so far lies in the folder.
@@ -113,7 +113,7 @@ def main(words: Sequence[str]) -> int:
         stride=arguments.stride,
     )
     inputs = (arguments.poses, arguments.calibration, arguments.dem, arguments.palette, *arguments.ground_truth)
-    check_apart(arguments.sequence, arguments.out, inputs)
+    check_inputs_apart(arguments.sequence, arguments.out, inputs)
     truth = TruthOptions(coding=choose_coding(arguments.remap, arguments.palette), crs=arguments.truth_crs)
     files = GroundFiles(arguments.ground_truth, truth, arguments.dem, arguments.ground_below_camera_m)
     with console.steps("refining", "steps", 100) as advance:
@@ -135,7 +135,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _prior(arguments: RefineArguments) -> Any:
-    from jaxmap.refinement.solve import Prior
+    from jaxmap.refinement.solver import Prior
 
     def sigma(what: What, value: float) -> float:
         return value if what in arguments.adjust else 0.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmap.host.files import atomic_path
 from jaxmap.refinement.consistency import Consistency
-from jaxmap.refinement.rounds import Refinement
+from jaxmap.refinement.refine import Refinement
 from jaxmap.report.charts import Chart, Mark, Series, line_chart
 from jaxmap.report.inline import inline_image
 from jaxmap.report.page import page
