@@ -91,7 +91,7 @@ def test_the_results_tell_what_was_found(refined):
     assert 'class="chart"' in page and "svg.chart {" in page, "without its style, the curve is a black square"
     assert not (refined / "calibration.yaml").exists()
     whole_map, frames = tables_of(page)
-    assert whole_map.headings == ["", "found", "± 1 σ", "given ± 1 σ", "told by the data"]
+    assert whole_map.headings == ["", "found", "± 1 σ", "prior ± 1 σ", "observable"]
     found = whole_map.row("up m")
     assert found[-1] == "yes" and float(found[1]) == pytest.approx(whole["up_m"]["sigma"], rel=0.02)
     assert float(found[2]) == pytest.approx(whole["up_m"]["prior_sigma"], rel=0.02)
