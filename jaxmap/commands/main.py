@@ -39,7 +39,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         restart_with_lasting_memory()
     try:
         command = importlib.import_module(f"jaxmap.commands.{words[0]}")
-        return command.main(words[1:]) or 0
+        status = command.main(words[1:]) or 0
+        # Here, so that a closed pipe is noticed before Python exits.
+        sys.stdout.flush()
+        return status
     except JaxmapError as error:
         if debug:
             raise

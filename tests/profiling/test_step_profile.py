@@ -1,4 +1,4 @@
-"""A profile of a run: every stage of the step is named in its program, traced, and told in metrics.json."""
+"""A profile of a run: every stage of the step is named in its program, traced, and reported in metrics.json."""
 
 from __future__ import annotations
 
@@ -14,10 +14,14 @@ from planned_runs import planned
 from jaxmap.errors import JaxmapError
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import compile_step
-from jaxmap.profiling.peaks import Peaks
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program
-from jaxmap.profiling.step_profile import StepProfile, stage_table, table_lines
-from jaxmap.profiling.trace import read_operation_times
+from jaxmap.profiling.step_profile import (
+    Peaks,
+    StepProfile,
+    read_operation_times,
+    stage_table,
+    table_lines,
+)
 
 
 def event_names(folder: Path) -> set[str]:
@@ -39,9 +43,8 @@ FUSION = ("project", "transform", "carve", "count_points", "frame_evidence", "ad
 @pytest.mark.parametrize(
     ("settings", "stages"),
     [
-        ({}, (*FUSION, "mlesac", "plane_labels")),
-        ({"labeller": "deeplab"}, (*FUSION, "network", "pixel_labels")),
         ({"ensemble": {"members": 2}}, (*FUSION, "mlesac", "plane_labels", "fuse_members")),
+        pytest.param({"labeller": "deeplab"}, (*FUSION, "network", "pixel_labels"), marks=pytest.mark.slow),
     ],
 )
 def test_every_stage_is_named_in_the_compiled_step(scene_folder, settings, stages):
@@ -52,7 +55,7 @@ def test_every_stage_is_named_in_the_compiled_step(scene_folder, settings, stage
     assert named <= {*STAGES, OTHER}
 
 
-def test_a_profiled_run_tells_where_its_steps_went(cli, scene_folder, tmp_path):
+def test_a_profiled_run_reports_where_its_steps_went(cli, scene_folder, tmp_path):
     run = tmp_path / "run"
     outcome = cli(*map_words(scene_folder, run, "--profile"))
     assert outcome.status == 0
@@ -85,7 +88,7 @@ def test_without_a_folder_nothing_is_recorded():
     assert profile.summary(lambda: "HloModule jit_step") is None
 
 
-def test_a_missing_trace_is_told(tmp_path):
+def test_a_missing_trace_is_an_error(tmp_path):
     with pytest.raises(JaxmapError, match="no trace was written"):
         read_operation_times(tmp_path, "jit_step")
 
@@ -99,7 +102,7 @@ OPERATIONS = {
 RUNS = [{"copy": [1e-3], "dot": [1e-3], "tick": [1e-5] * 3, "unknown": [5.0]}] * 2 + [{"copy": [9.0], "dot": [9.0]}]
 
 
-def test_the_table_is_as_reckoned_by_hand():
+def test_the_table_is_as_computed_by_hand():
     table = stage_table(OPERATIONS, RUNS, PEAKS)
     assert list(table) == ["mlesac", "network", "carve"]
     assert table["carve"]["gb_per_s"] == 8.0
