@@ -173,14 +173,14 @@ def table_lines(summary: Mapping[str, Any]) -> list[str]:
 
 
 class Peaks(NamedTuple):
-    """Peak rates of a machine: bytes read and written by a copy, and operations of a float32 matrix product, a second."""
+    """Peak rates of a machine, per second: bytes of a copy, read and written, and operations of a float32 product."""
 
     bytes_per_s: float
     flops_per_s: float
 
 
 def measure_peaks() -> Peaks:
-    """Negates 128 MiB in place, more than caches hold, and multiplies 2048 x 2048 matrices: the median of seven each."""
+    """Negates 128 MiB in place, more than caches hold; multiplies 2048 x 2048 matrices: each the median of seven."""
     # In place: allocating fresh memory takes longer than filling it.
     negate = jax.jit(jnp.negative, donate_argnums=0)
     values, matrix = jnp.ones(_COPIED, jnp.float32), jnp.ones((_EDGE, _EDGE), jnp.float32)

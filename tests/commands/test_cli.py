@@ -116,10 +116,10 @@ def test_of_a_config_given_twice_the_last_one_counts(settings_of, tmp_path):
 
 
 def test_a_run_ends_with_where_its_outputs_are(cli, scene_folder, tmp_path):
-    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--labeller", "none", "--stop", "1"))
+    outcome = cli(*map_words(scene_folder, tmp_path / "run"))
     assert outcome.status == 0
     assert outcome.out.splitlines()[-1].startswith(f"wrote {tmp_path / 'run'}/: report.html, map.zarr")
-    assert "1 of 1 frames fused" in outcome.err
+    assert "6 of 6 frames fused" in outcome.err
 
 
 def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
