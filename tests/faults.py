@@ -213,6 +213,7 @@ SETTINGS_FAULTS: dict[str, tuple[int, Damage]] = {
     "penalties the wrong way round": (2, with_settings(stereo={"p1": 9, "p2": 3})),
     "matrix of another size": (2, with_settings(fusion={"class_increments": [[1.0, 0.0], [0.0, 1.0]]})),
     "too large a map": (1, with_settings(grid={"max_memory_gib": 1e-4, "voxel_size_m": 0.1})),
+    "more voxels than 64 bits can count": (1, with_settings(grid={"voxel_size_m": 1e-6})),
     "too many members": (
         1,
         with_settings(grid={"max_memory_gib": 1e-3, "voxel_size_m": 0.1}, ensemble={"members": 40}),

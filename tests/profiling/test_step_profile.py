@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import pytest
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
 from jax.profiler import ProfileData
@@ -16,6 +17,8 @@ from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import compile_step
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program
 from jaxmap.profiling.step_profile import (
+    TRACED_FRAMES,
+    WARM_UP_FRAMES,
     Peaks,
     StepProfile,
     read_operation_times,
@@ -43,7 +46,12 @@ FUSION = ("project", "transform", "carve", "count_points", "frame_evidence", "ad
 @pytest.mark.parametrize(
     ("settings", "stages"),
     [
-        ({"ensemble": {"members": 2}}, (*FUSION, "mlesac", "plane_labels", "fuse_members")),
+        ({}, (*FUSION, "mlesac", "plane_labels")),
+        pytest.param(
+            {"ensemble": {"members": 2}},
+            (*FUSION, "mlesac", "plane_labels", "fuse_members"),
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"labeller": "deeplab"}, (*FUSION, "network", "pixel_labels"), marks=pytest.mark.slow),
     ],
 )
@@ -55,6 +63,29 @@ def test_every_stage_is_named_in_the_compiled_step(scene_folder, settings, stage
     assert named <= {*STAGES, OTHER}
 
 
+def test_a_trace_of_steps_is_summed_by_stages(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxmap.profiling.step_profile.measure_peaks", lambda: PEAKS)
+
+    def step(values):
+        with jax.named_scope("carve"):
+            values = jnp.sin(values @ values)
+        with jax.named_scope("mlesac"):
+            return jnp.cumsum(jnp.sort(values), axis=0)
+
+    compiled = jax.jit(step).lower(jnp.ones((200, 200))).compile()
+    profile, values = StepProfile(tmp_path), jnp.ones((200, 200))
+    for _ in range(WARM_UP_FRAMES + TRACED_FRAMES + 2):
+        values = compiled(values).block_until_ready()
+        profile.step_done()
+    summary = profile.summary(compiled.as_text)
+    assert summary is not None
+    assert summary["frames"] == TRACED_FRAMES
+    assert set(summary["stages"]) >= {"carve", "mlesac"}
+    assert sum(row["share"] for row in summary["stages"].values()) == pytest.approx(1, abs=0.01)
+    assert all(row["median_ms"] > 0 for row in summary["stages"].values())
+
+
+@pytest.mark.slow
 def test_a_profiled_run_reports_where_its_steps_went(cli, scene_folder, tmp_path):
     run = tmp_path / "run"
     outcome = cli(*map_words(scene_folder, run, "--profile"))

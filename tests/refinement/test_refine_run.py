@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +26,11 @@ from jaxmap.datasets.label_coding import choose_coding
 from jaxmap.datasets.pose_files import read_poses, write_tum
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.output_folder import locked
+from jaxmap.refinement.consistency import Consistency
 from jaxmap.refinement.frames import pinhole
 from jaxmap.refinement.refine import GroundReference, Refinement, refine
-from jaxmap.refinement.solver import Prior
+from jaxmap.refinement.rig import PER_FRAME, SHARED, make_rig
+from jaxmap.refinement.solver import Prior, Solution
 from jaxmap.runs.evaluation import TruthOptions
 from jaxmap.runs.refinement import (
     GroundFiles,
@@ -39,6 +42,7 @@ from jaxmap.runs.refinement import (
     run_refine,
 )
 from jaxmap.stereo.rectify import make_rectifier, make_stereo_rig
+from jaxmap.types import make_grid
 
 FRAMES = 4
 T_TRUE = np.stack([pose(index) for index in range(FRAMES)])
@@ -89,11 +93,19 @@ def inputs(scene_folder) -> RefineInputs:
     return read_inputs(str(scene_folder), ReadOptions(stop=2))
 
 
+D = np.eye(4)
+D[:3, :3], D[:3, 3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix(), [0.1, 0.2, -0.3]
+
+
 @pytest.fixture(scope="module")
 def state(inputs) -> Refinement:
-    """Two frames, refined."""
-    camera = pinhole(inputs.front_end.camera)
-    return refine(inputs.frames, inputs.T_world_camera, camera, Prior(), GroundReference(), (0.3, 5.0))
+    """What a refinement of two frames may come to: a displaced mounting, a longer baseline, a disparity offset."""
+    given = make_rig(inputs.T_world_camera)
+    numbers = PER_FRAME * len(inputs.frames) + SHARED
+    rig = replace(given, T_nominal_camera=D, log_baseline_scale=float(np.log(1.01)), offset_px=0.25)
+    solution = Solution(rig, 0.01 * np.eye(numbers), np.ones(numbers), [2.0, 0.5], [1.0])
+    columns = Consistency(0.03, 5.0, np.full((4, 4), 0.03), make_grid([0, 0, 0], [0.4, 0.4, 0.1], 0.1))
+    return Refinement(given, solution, columns, columns, [2.0, 0.5], [(0, "neighbours")], pairs=1, matches=20)
 
 
 @pytest.fixture
@@ -106,7 +118,11 @@ def run(inputs, state, scene_folder, monkeypatch):
 
     monkeypatch.setattr(jaxmap.runs.refinement, "read_inputs", lambda *_: inputs)
     monkeypatch.setattr(jaxmap.runs.refinement, "refine", refined)
-    return lambda out, **more: run_refine(str(scene_folder), out, ReadOptions(), Prior(), GroundFiles(), **more)
+
+    def run(out: Path, prior: Prior | None = None, **more: object) -> dict:
+        return run_refine(str(scene_folder), out, ReadOptions(), prior or Prior(), GroundFiles(), **more)
+
+    return run
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -150,10 +166,25 @@ def test_the_results_state_what_was_found(refined):
     assert matched == "yes"
 
 
+def test_what_was_adjusted_of_the_calibration_is_written(run, inputs, tmp_path):
+    run(tmp_path / "out", Prior(mounting_m=0.1, mounting_rad=0.1, baseline_scale=0.01, offset_px=0.5))
+    path = tmp_path / "out" / "calibration.yaml"
+    before, after = inputs.sequence.camera, read_camera_yaml(path)
+    np.testing.assert_allclose(read_mounting(path), D, atol=1e-9)
+    assert float(after.baseline_m) == pytest.approx(1.01 * float(before.baseline_m), rel=1e-6)
+    assert float(after.doffs_px) == pytest.approx(float(before.doffs_px) + 0.25)
+    np.testing.assert_allclose(read_poses(tmp_path / "out" / "poses.tum").T, inputs.T_world_camera @ D, atol=1e-6)
+    run(tmp_path / "fixed", Prior(mounting_m=0.1))
+    assert (tmp_path / "fixed" / "calibration.yaml").exists()
+    run(tmp_path / "poses")
+    assert not (tmp_path / "poses" / "calibration.yaml").exists()
+
+
+@pytest.mark.slow
 def test_mounting_and_offset_go_into_a_calibration(cli, scene_folder, tmp_path):
-    D = np.eye(4)
-    D[:3, :3] = Rotation.from_rotvec([np.radians(2), 0, 0]).as_matrix()
-    write_tum(tmp_path / "wrong.tum", TIMES_S, T_TRUE @ D)
+    pitched = np.eye(4)
+    pitched[:3, :3] = Rotation.from_rotvec([np.radians(2), 0, 0]).as_matrix()
+    write_tum(tmp_path / "wrong.tum", TIMES_S, T_TRUE @ pitched)
     words = ("--adjust", "poses", "mounting", "offset", "--sigma-position-m", 0.002, "--sigma-angle-deg", 0.02)
     out = tmp_path / "out"
     outcome = cli("refine", scene_folder, "--out", out, "--poses", tmp_path / "wrong.tum", *words, *WORDS)
@@ -168,8 +199,6 @@ def test_mounting_and_offset_go_into_a_calibration(cli, scene_folder, tmp_path):
 
 
 def test_a_mounting_moves_the_poses_of_a_sequence_but_not_those_given_of_the_camera(scene_folder, tmp_path):
-    D = np.eye(4)
-    D[:3, :3], D[:3, 3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix(), [0.1, 0.2, -0.3]
     path = tmp_path / "mounted.yaml"
     write_camera_yaml(path, read_camera_yaml(scene_folder / "camera.yaml"), D)
     own = open_sequence(scene_folder, ReadOptions(calibration=path)).T_world_camera
