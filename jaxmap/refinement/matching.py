@@ -41,7 +41,6 @@ MIN_OVERLAP = 0.3
 PATCHES = 150
 WORKING_WIDTH_PX = 512
 """Images are shrunk to about so many columns: finer detail is mostly noise."""
-
 Advance = Callable[[int], None]
 
 
@@ -230,13 +229,11 @@ def match_pair(
     source_px = _full_size(corners[kept].astype(np.float64), search.scale)
     at_target = np.stack([sample_bilinear(maps[axis], places) for axis in range(2)], axis=-1)
     target_px = _full_size(at_target, search.scale)
-    uvd_px = np.stack(
-        [
-            np.column_stack([pixels, sample_bilinear(frame.disparity_px, pixels)])
-            for frame, pixels in ((source, source_px), (target, target_px))
-        ],
-        axis=1,
-    )
+    seen = [
+        np.column_stack([pixels, sample_bilinear(frame.disparity_px, pixels)])
+        for frame, pixels in ((source, source_px), (target, target_px))
+    ]
+    uvd_px = np.stack(seen, axis=1)
     return _explained_by_one_motion(uvd_px[np.isfinite(uvd_px).all(axis=(1, 2))], camera, RANSAC_PX * search.scale)
 
 

@@ -133,30 +133,61 @@ def refine(
             f"{len(frames)} frame with disparities", fix="refining needs two frames that overlap, or more"
         )
     state = Refinement(make_rig(T_world_camera))
-    origin_m = T_world_camera[:, :3, 3].mean(axis=0)
+    problem = _Problem(frames, camera, prior, depth_range_m, T_world_camera[:, :3, 3].mean(axis=0), state)
     sparse, dense = (sample_pixels(frames, camera, depth_range_m, count) for count in (SPARSE, DENSE))
     if not len(sparse.frames):
         raise JaxmapError(
             f"no point lies between {depth_range_m[0]:g} and {depth_range_m[1]:g} m", fix="set --max-depth-m"
         )
+    state.before = _consistency(frames, state.rig, camera, dense)
+    matches = _align_frames(problem, advance, on_round)
+    _tie_to_ground(problem, matches, ground, sparse, dense, on_round)
+    state.after = _consistency(frames, state.rig, camera, dense)
+    on_round(state)
+    return state
 
-    def solve_with(name: str, terms: list[ResidualTerm], steps: int = MAX_STEPS) -> None:
-        solution = solve(state.rig, state.given, terms, prior, steps)
+
+class _Problem(NamedTuple):
+    """What stays the same in all rounds, and the state."""
+
+    frames: Sequence[DisparityFrame]
+    camera: Pinhole
+    prior: Prior
+    depth_range_m: tuple[float, float]
+    origin_m: np.ndarray
+    state: Refinement
+
+    def match_term(self, matches: MatchTable) -> ResidualTerm:
+        return ResidualTerm(
+            lambda rig: linearise(make_device_rig(rig, self.camera, self.origin_m), matches.frames, matches.uvd_px),
+            matches.frames,
+            np.array([MATCH_SIGMA_PX, MATCH_SIGMA_PX, DISPARITY_SIGMA_PX]),
+            DISPARITY_SIGMA_PX,
+            matches.pairs,
+            PAIR_WEIGHT,
+        )
+
+    def height_term(self, samples: PixelSamples, heights: GroundRaster, blur_m: float = 0.0) -> ResidualTerm:
+        return height_term(samples, self.camera, heights, self.origin_m, DISPARITY_SIGMA_PX, blur_m)
+
+    def solve(self, name: str, terms: list[ResidualTerm], steps: int = MAX_STEPS) -> None:
+        state = self.state
+        solution = solve(state.rig, state.given, terms, self.prior, steps)
         state.rounds.append((len(state.residuals_px), name))
         state.residuals_px += solution.residuals_px
         state.solution = solution
 
-    def on_ground(samples: PixelSamples, heights: GroundRaster, blur_m: float = 0.0) -> ResidualTerm:
-        return height_term(samples, camera, heights, origin_m, DISPARITY_SIGMA_PX, blur_m)
 
-    # Frames agree with each other: neighbours first, then all that overlap.
-    state.before = _consistency(frames, state.given, camera, dense)
+def _align_frames(problem: _Problem, advance: Advance, on_round: OnRound) -> MatchTable:
+    """Makes the frames agree with each other: neighbours first, then all that overlap."""
+    frames, camera, prior, depth_range_m, _, state = problem
     uncertainty = PoseUncertainty(
         FIRST_POSITION_M if prior.position_m is None else max(prior.position_m, 0.05),
         FIRST_ANGLE_RAD if prior.angle_rad is None else max(prior.angle_rad, np.radians(0.2)),
     )
+    poses = state.given.T_world_camera
     found = match_neighbours(
-        frames, T_world_camera, camera, uncertainty, depth_range_m, lambda done: advance(done, "neighbours")
+        frames, poses, camera, uncertainty, depth_range_m, lambda done: advance(done, "neighbours")
     )
     if not found:
         raise JaxmapError(
@@ -164,7 +195,7 @@ def refine(
             fix="check the poses, or say how wrong they may be: --sigma-position-m, --sigma-angle-deg",
         )
     matches = match_table(found)
-    solve_with("neighbours", [_match_term(matches, camera, origin_m)])
+    problem.solve("neighbours", [problem.match_term(matches)])
     on_round(state)
     for number, radius_px in enumerate(RADII_PX, start=1):
 
@@ -174,51 +205,47 @@ def refine(
         poses = state.rig.T_world_camera
         found = match_overlapping(frames, poses, camera, depth_range_m, radius_px, advance_round)
         matches = match_table(found) if found else matches
-        solve_with("all pairs", [_match_term(matches, camera, origin_m)])
+        problem.solve("all pairs", [problem.match_term(matches)])
         on_round(state)
     state.pairs, state.matches = len(found), len(matches.pairs)
     state.unmatched = sorted(set(range(len(frames))) - set(matches.frames.ravel().tolist()))
+    return matches
 
-    # The map as a whole is tied to the ground.
-    terms = [_match_term(matches, camera, origin_m)]
+
+def _tie_to_ground(
+    problem: _Problem,
+    matches: MatchTable,
+    ground: GroundReference,
+    sparse: PixelSamples,
+    dense: PixelSamples,
+    on_round: OnRound,
+) -> None:
+    """Solves again with what ties the map as a whole to the ground."""
+    state, terms = problem.state, [problem.match_term(matches)]
     if ground.below_camera_m is not None:
         contact = ground_contact(state.given.T_world_camera[:, :3, 3], ground.below_camera_m)
-        terms.append(on_ground(dense, contact))
-        solve_with("ground under the rover", terms)
+        terms.append(problem.height_term(dense, contact))
+        problem.solve("ground under the rover", terms)
     if ground.heights is not None:
         for blur_m in BLURS_M:
-            on_model = on_ground(sparse, ground.heights, blur_m)
+            on_model = problem.height_term(sparse, ground.heights, blur_m)
             steps = FEW_STEPS if blur_m else MAX_STEPS
-            solve_with(f"elevation model, smoothed over {blur_m:g} m", [*terms, on_model], steps)
-        terms.append(on_ground(sparse, ground.heights))
+            problem.solve(f"elevation model, smoothed over {blur_m:g} m", [*terms, on_model], steps)
+        terms.append(problem.height_term(sparse, ground.heights))
         on_round(state)
     if ground.is_rock is not None:
-        relief = rock_relief(points_world(state.rig, camera, dense))
-        placed = register_labels(relief, ground.is_rock, (float(origin_m[0]), float(origin_m[1])))
+        relief = rock_relief(points_world(state.rig, problem.camera, dense))
+        placed = register_labels(relief, ground.is_rock, (float(problem.origin_m[0]), float(problem.origin_m[1])))
         if placed is None:
             state.notes.append("too little labelled rock is in view to locate the map by it")
-        else:
-            alignment, sigma = placed
-            off_m, turned_deg = np.hypot(*alignment.shift_m), np.degrees(abs(alignment.heading_rad))
-            state.notes.append(
-                f"by its rocks the map is {off_m:.2f} m and {turned_deg:.1f} deg away from the labels, "
-                f"+- {sigma[0]:.2f} m and {np.degrees(sigma[2]):.1f} deg (1 sigma)"
-            )
-            solve_with("labelled rocks", [*terms, placement_term(state.rig, alignment, sigma)])
-    state.after = _consistency(frames, state.rig, camera, dense)
-    on_round(state)
-    return state
-
-
-def _match_term(matches: MatchTable, camera: Pinhole, origin_m: np.ndarray) -> ResidualTerm:
-    return ResidualTerm(
-        lambda rig: linearise(make_device_rig(rig, camera, origin_m), matches.frames, matches.uvd_px),
-        matches.frames,
-        np.array([MATCH_SIGMA_PX, MATCH_SIGMA_PX, DISPARITY_SIGMA_PX]),
-        DISPARITY_SIGMA_PX,
-        matches.pairs,
-        PAIR_WEIGHT,
-    )
+            return
+        alignment, sigma = placed
+        off_m, turned_deg = np.hypot(*alignment.shift_m), np.degrees(abs(alignment.heading_rad))
+        state.notes.append(
+            f"by its rocks the map is {off_m:.2f} m and {turned_deg:.1f} deg away from the labels, "
+            f"+- {sigma[0]:.2f} m and {np.degrees(sigma[2]):.1f} deg (1 sigma)"
+        )
+        problem.solve("labelled rocks", [*terms, placement_term(state.rig, alignment, sigma)])
 
 
 def _consistency(frames: Sequence[DisparityFrame], rig: Rig, camera: Pinhole, points: PixelSamples) -> Consistency:
