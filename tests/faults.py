@@ -1,4 +1,4 @@
-"""Ways to spoil a plain folder or the command line of `jaxmap map`, each with the exit status it must give."""
+"""Ways to spoil a plain folder or the settings of `jaxmap map`, each with the exit status it must give."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from PIL import Image
 from safetensors.numpy import save_file
 from scenes import CAMERA
 
-Damage = Callable[[Path, Path], list[str] | None]
-"""Takes the scene and an empty folder, and returns words for the command line."""
+Damage = Callable[[Path, Path], dict[str, object] | None]
+"""Takes the scene and an empty folder, and returns settings."""
 
 
 def rewrite(path: Path, change: Callable[[list[str]], list[str]]) -> None:
@@ -28,47 +28,34 @@ def with_camera(**changes: object) -> Damage:
     return damage
 
 
-def with_yaml(text: str) -> Damage:
-    def damage(scene: Path, folder: Path) -> list[str]:
-        (folder / "mine.yaml").write_text(text)
-        return ["--config", str(folder / "mine.yaml")]
-
-    return damage
+def with_settings(**settings: object) -> Damage:
+    return lambda scene, folder: settings
 
 
-def with_words(*words: str) -> Damage:
-    return lambda scene, folder: list(words)
-
-
-def missing_right(scene: Path, folder: Path) -> list[str]:
+def missing_right(scene: Path, folder: Path) -> None:
     (scene / "right" / "f002.png").unlink()
-    return ["--strict"]
 
 
 def missing_left(scene: Path, folder: Path) -> None:
     (scene / "left" / "f002.png").unlink()
 
 
-def truncated(scene: Path, folder: Path) -> list[str]:
+def truncated(scene: Path, folder: Path) -> None:
     image = scene / "left" / "f001.png"
     image.write_bytes(image.read_bytes()[:4000])
-    return ["--strict"]
 
 
-def no_image(scene: Path, folder: Path) -> list[str]:
+def no_image(scene: Path, folder: Path) -> None:
     (scene / "right" / "f000.png").write_bytes(b"no picture at all")
-    return ["--strict"]
 
 
-def smaller_right(scene: Path, folder: Path) -> list[str]:
+def smaller_right(scene: Path, folder: Path) -> None:
     Image.fromarray(np.zeros((90, 160), np.uint8)).save(scene / "right" / "f000.png")
-    return ["--strict"]
 
 
-def smaller_pair(scene: Path, folder: Path) -> list[str]:
+def smaller_pair(scene: Path, folder: Path) -> None:
     for side in ("left", "right"):
         Image.fromarray(np.zeros((90, 160), np.uint8)).save(scene / side / "f003.png")
-    return ["--strict"]
 
 
 def all_unreadable(scene: Path, folder: Path) -> None:
@@ -101,10 +88,10 @@ def long_quaternion(scene: Path, folder: Path) -> None:
     rewrite(scene / "poses.tum", lambda lines: [*lines[:3], lines[3].rsplit(" ", 1)[0] + " 3", *lines[4:]])
 
 
-def skewed_pose(scene: Path, folder: Path) -> list[str]:
+def skewed_pose(scene: Path, folder: Path) -> dict[str, object]:
     rows = ["1 0 0 0 0 0 1 0 0 -1 0 1"] * 5 + ["1 0 0.4 0 0 0 1 0 0 -1 0 1"]
     (folder / "poses.txt").write_text("\n".join(rows))
-    return ["--poses", str(folder / "poses.txt")]
+    return {"poses": folder / "poses.txt"}
 
 
 def no_poses(scene: Path, folder: Path) -> None:
@@ -131,9 +118,9 @@ def no_images(scene: Path, folder: Path) -> None:
 
 
 def labels(damage: Callable[[Path], None]) -> Damage:
-    def spoil(scene: Path, folder: Path) -> list[str]:
+    def spoil(scene: Path, folder: Path) -> dict[str, object]:
         damage(scene / "labels")
-        return ["--labeller", "files", "--labels", str(scene / "labels"), "--strict"]
+        return {"labeller": "files", "labels": scene / "labels"}
 
     return spoil
 
@@ -164,28 +151,21 @@ def wild_probabilities(folder: Path) -> None:
         np.save(folder / f"{file.stem}.npy", np.full((120, 160, 3), 0.7, np.float32))
 
 
-def deeplab(*words: str, **model: bool) -> Damage:
-    def damage(scene: Path, folder: Path) -> list[str]:
-        path = write_small_model(folder / "model.safetensors", **model)
-        return ["--labeller", "deeplab", "--model", str(path), *words]
+def deeplab(*, backbone_only: bool = False, **settings: object) -> Damage:
+    def damage(scene: Path, folder: Path) -> dict[str, object]:
+        path = write_small_model(folder / "model.safetensors", backbone_only=backbone_only)
+        return {"labeller": "deeplab", "model": path, **settings}
 
     return damage
 
 
-def no_model(scene: Path, folder: Path) -> list[str]:
+def no_model(scene: Path, folder: Path) -> dict[str, object]:
     save_file({"weight": np.zeros(3, np.float32)}, folder / "model.safetensors")
-    return ["--labeller", "deeplab", "--model", str(folder / "model.safetensors")]
+    return {"labeller": "deeplab", "model": folder / "model.safetensors"}
 
 
-MAP_FAULTS: dict[str, tuple[int, Damage]] = {
-    "missing right image": (1, missing_right),
+SEQUENCE_FAULTS: dict[str, tuple[int, Damage]] = {
     "missing left image": (1, missing_left),
-    "truncated image": (1, truncated),
-    "not an image": (1, no_image),
-    "left and right of different size": (1, smaller_right),
-    "one pair of another size": (1, smaller_pair),
-    "all frames unreadable": (1, all_unreadable),
-    "images of another size than the calibration": (1, with_camera(image_size_px=[320, 240])),
     "times not increasing": (1, times_back),
     "pose times not increasing": (1, pose_times_back),
     "no times": (1, no_times),
@@ -195,58 +175,81 @@ MAP_FAULTS: dict[str, tuple[int, Damage]] = {
     "non-rigid pose": (1, skewed_pose),
     "no poses": (1, no_poses),
     "poses of another clock": (1, other_clock),
-    "no such pose file": (1, with_words("--poses", "nowhere/poses.tum")),
+    "no such pose file": (1, with_settings(poses=Path("nowhere/poses.tum"))),
+    "images of another size than the calibration": (1, with_camera(image_size_px=[320, 240])),
     "zero baseline": (1, with_camera(baseline_m=0.0)),
     "negative baseline": (1, with_camera(baseline_m=-0.12)),
     "NaN focal length": (1, with_camera(fx_px=float("nan"))),
     "no calibration": (1, no_calibration),
     "unknown calibration key": (1, with_camera(baseline=0.1)),
-    "left and right swapped": (1, swapped),
     "no images": (1, no_images),
-    "no frame selected": (1, with_words("--start", "9")),
-    "unknown data set": (2, with_words("--dataset", "mars")),
-    "another data set": (1, with_words("--dataset", "kitti")),
-    "unknown keys in the config": (2, with_yaml("grid: {voxel_size: 0.1}\nlabeler: plane\n")),
-    "out of range in the config": (2, with_yaml("fusion: {occupancy_prior: 1.5}\nstride: 0\n")),
-    "NaN in the config": (2, with_yaml("depth: {max_m: .nan}\n")),
-    "wrong type in the config": (2, with_yaml("grid: 3\n")),
-    "keys that are no text in the config": (2, with_yaml("1.5: 3\nnull: 2\n")),
-    "malformed YAML": (2, with_yaml("grid: [0.1\nstride: 1\n")),
-    "a config that is a list": (2, with_yaml("- 1\n")),
-    "unknown config": (2, with_words("--config", "chiodini2019")),
-    "out of range on the command line": (2, with_words("--plane.threshold-m", "-1")),
-    "unknown class": (2, with_words("--plane.off-plane", "boulder")),
-    "nearest depth beyond the farthest": (2, with_words("--depth.min-m", "9")),
-    "odd disparities": (2, with_words("--stereo.num-disparities", "20")),
-    "even block": (2, with_words("--stereo.block-size", "4")),
-    "matrix of another size": (2, with_yaml("fusion: {class_increments: [[1, 0], [0, 1]]}\n")),
-    "penalties the wrong way round": (2, with_words("--stereo.p1", "9", "--stereo.p2", "3")),
-    "too large a map": (1, with_words("--grid.max-memory-gib", "1e-4", "--grid.voxel-size-m", "0.1")),
-    "too many members": (
-        1,
-        with_words("--grid.max-memory-gib", "1e-3", "--grid.voxel-size-m", "0.1", "--ensemble.members", "40"),
-    ),
-    "an ensemble without a class": (2, with_words("--ensemble.members", "2", "--labeller", "none")),
-    "an ensemble of a spread below zero": (2, with_words("--ensemble.heading-sigma-rad", "-1")),
-    "bounds the wrong way round": (2, with_words("--grid.lower-m", "3", "0", "0")),
-    "files without a folder": (2, with_words("--labeller", "files")),
-    "no such folder of labels": (1, with_words("--labeller", "files", "--labels", "nowhere")),
+    "no frame selected": (1, with_settings(start=9)),
+    "unknown data set": (2, with_settings(dataset="mars")),
+    "another data set": (1, with_settings(dataset="kitti")),
+}
+"""Found when the sequence is opened."""
+
+FRAME_FAULTS: dict[str, tuple[int, Damage]] = {
+    "missing right image": (1, missing_right),
+    "truncated image": (1, truncated),
+    "not an image": (1, no_image),
+    "left and right of different size": (1, smaller_right),
+    "one pair of another size": (1, smaller_pair),
+    "left and right swapped": (1, swapped),
     "missing label": (1, labels(missing_label)),
-    "first label missing": (1, labels(first_label_missing)),
     "label of another size": (1, labels(small_label)),
     "class out of range": (1, labels(strange_label)),
     "label in colours": (1, labels(colour_label)),
     "probabilities over 1": (1, labels(wild_probabilities)),
-    "a model without deeplab": (2, with_words("--model", "model.safetensors")),
-    "no such model": (1, with_words("--labeller", "deeplab", "--model", "nowhere.safetensors")),
+}
+"""Found when a frame is read."""
+
+SETTINGS_FAULTS: dict[str, tuple[int, Damage]] = {
+    "out of range": (2, with_settings(plane={"threshold_m": -1.0})),
+    "unknown class": (2, with_settings(plane={"off_plane": "boulder"})),
+    "nearest depth beyond the farthest": (2, with_settings(depth={"min_m": 9.0})),
+    "odd disparities": (2, with_settings(stereo={"num_disparities": 20})),
+    "even block": (2, with_settings(stereo={"block_size": 4})),
+    "penalties the wrong way round": (2, with_settings(stereo={"p1": 9, "p2": 3})),
+    "matrix of another size": (2, with_settings(fusion={"class_increments": [[1.0, 0.0], [0.0, 1.0]]})),
+    "too large a map": (1, with_settings(grid={"max_memory_gib": 1e-4, "voxel_size_m": 0.1})),
+    "more voxels than 64 bits can count": (1, with_settings(grid={"voxel_size_m": 1e-6})),
+    "too many members": (
+        1,
+        with_settings(grid={"max_memory_gib": 1e-3, "voxel_size_m": 0.1}, ensemble={"members": 40}),
+    ),
+    "an ensemble without a class": (2, with_settings(ensemble={"members": 2}, labeller="none")),
+    "an ensemble of a spread below zero": (2, with_settings(ensemble={"heading_sigma_rad": -1.0})),
+    "one bound alone": (2, with_settings(grid={"upper_m": None})),
+    "bounds the wrong way round": (2, with_settings(grid={"lower_m": [3.0, 0.0, 0.0]})),
+    "files without a folder": (2, with_settings(labeller="files")),
+    "no such folder of labels": (1, with_settings(labeller="files", labels=Path("nowhere"))),
+    "first label missing": (1, labels(first_label_missing)),
+    "a model without deeplab": (2, with_settings(model=Path("model.safetensors"))),
+    "no such model": (1, with_settings(labeller="deeplab", model=Path("nowhere.safetensors"))),
     "a model that is none": (1, no_model),
     "a backbone to label the map": (1, deeplab(backbone_only=True)),
-    "another model than was told": (2, deeplab("--model-sha256", "0" * 64)),
-    "classes that the network has not": (2, deeplab("--classes", "sand", "mud", "clay")),
+    "another model than recorded": (2, deeplab(model_sha256="0" * 64)),
+    "classes that the network has not": (2, deeplab(classes=["sand", "mud", "clay"])),
     "a class map of unknown names": (
         2,
-        deeplab("--classes", "sand", "rock", "--deeplab.class-map", "stone=rock", "pebble=rock", "gravel=stones"),
+        deeplab(
+            classes=["sand", "rock"],
+            deeplab={"class_map": {"stone": "rock", "pebble": "rock", "gravel": "stones"}},
+        ),
     ),
-    "a network of no size": (2, deeplab("--deeplab.size-px", "0", "64")),
-    "no temperature": (2, deeplab("--deeplab.temperature", "0")),
+    "a network of no size": (2, deeplab(deeplab={"size_px": [0, 64]})),
+    "no temperature": (2, deeplab(deeplab={"temperature": 0.0})),
 }
+"""Found when the settings are checked and the run is planned."""
+
+CONFIG_FAULTS: dict[str, str] = {
+    "unknown keys in the config": "grid: {voxel_size: 0.1}\nlabeler: plane\n",
+    "out of range in the config": "fusion: {occupancy_prior: 1.5}\nstride: 0\n",
+    "NaN in the config": "depth: {max_m: .nan}\n",
+    "wrong type in the config": "grid: 3\n",
+    "keys that are no text in the config": "1.5: 3\nnull: 2\n",
+    "malformed YAML": "grid: [0.1\nstride: 1\n",
+    "a config that is a list": "- 1\n",
+}
+"""Found when a YAML file is read; all have exit status 2."""

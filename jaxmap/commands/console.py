@@ -1,4 +1,4 @@
-"""What the commands share: parsing of options, lines for the user, progress."""
+"""What the commands share: parsing and checking options, lines for the user, progress."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 import tyro
+
+from jaxmap.errors import UsageError
 
 Arguments = TypeVar("Arguments")
 
@@ -23,7 +25,7 @@ def parse(
         kind: the dataclass of the options.
         command: its name.
         words: the command line after it.
-        with_config: gives the defaults under the configuration that `--config` names.
+        with_config: returns the defaults under the configuration that `--config` names.
     """
     defaults = {}
     if with_config is not None and (name := _value_of("--config", words)) is not None:
@@ -31,8 +33,26 @@ def parse(
     return tyro.cli(kind, prog=f"jaxmap {command}", args=list(words), **defaults)
 
 
+def check_bounds(arguments: object, command: str) -> None:
+    """Validates parsed options against the bounds in the annotations of their fields.
+
+    Raises:
+        UsageError: names every option that is out of bounds.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        TypeAdapter(type(arguments)).validate_python(vars(arguments))
+    except ValidationError as error:
+        faults = []
+        for fault in error.errors():
+            option, message = str(fault["loc"][0]).replace("_", "-"), fault["msg"]
+            faults.append(f"--{option} is {fault['input']}: {message[0].lower()}{message[1:]}")
+        raise UsageError("; ".join(faults), fix=f"see jaxmap {command} --help") from error
+
+
 def _value_of(option: str, words: Sequence[str]) -> str | None:
-    """The value of an option, the last one where it is given twice."""
+    """The value of an option; the last one where it is given twice."""
     value = None
     for index, word in enumerate(words):
         if word == option and index + 1 < len(words):
@@ -43,10 +63,10 @@ def _value_of(option: str, words: Sequence[str]) -> str | None:
 
 
 class Advance(Protocol):
-    """Takes the progress of long work."""
+    """Reports the progress of long work."""
 
     def __call__(self, done: int, note: str = "") -> None:
-        """So many are done; `note` says how it goes."""
+        """So many are done; `note` describes the current state."""
         ...
 
 
@@ -54,17 +74,17 @@ class Console:
     """Lines and progress on stderr, results on stdout."""
 
     def __init__(self) -> None:
-        """A progress bar is drawn only on a terminal; elsewhere a line now and then tells."""
+        """A progress bar is drawn only on a terminal; elsewhere a line is printed now and then."""
         from rich.console import Console as RichConsole
 
         self._rich = RichConsole(stderr=True, highlight=False, soft_wrap=True)
 
     def notify(self, line: str) -> None:
-        """One line for the user."""
+        """Prints one line for the user."""
         self._rich.print(line, markup=False)
 
     def result(self, folder: Path, names: Sequence[str]) -> None:
-        """Says where the outputs are."""
+        """Prints where the outputs are."""
         print(f"wrote {folder}/: {', '.join(names)}")
 
     def table(self, title: str, columns: Mapping[str, str], rows: Sequence[Mapping[str, object]]) -> None:
@@ -83,13 +103,13 @@ class Console:
 
     @contextmanager
     def progress(self, title: str, total: int) -> Iterator[Callable[[object], None]]:
-        """Shows progress over `total` frames; yields what is to be called after each."""
+        """Shows progress over `total` frames; yields a function to call after each."""
         with self.steps(title, "frames", total) as advance:
             yield lambda fused: advance(fused.prepared.index + 1)  # type: ignore[attr-defined]
 
     @contextmanager
     def steps(self, title: str, unit: str, total: int) -> Iterator[Advance]:
-        """Shows progress over `total` of `unit`; yields what is to be called with the number done, and a note."""
+        """Shows progress over `total` of `unit`; yields a function to call with the number done, and a note."""
         if not self._rich.is_terminal:
             yield self._plain_steps(title, unit, total)
             return
@@ -101,12 +121,12 @@ class Console:
             yield lambda done, note="": bar.update(task, completed=done, note=note)
 
     def _plain_steps(self, title: str, unit: str, total: int) -> Advance:
-        told_s = time.monotonic()
+        printed_s = time.monotonic()
 
         def advance(done: int, note: str = "") -> None:
-            nonlocal told_s
-            if time.monotonic() - told_s > 10:
-                told_s = time.monotonic()
+            nonlocal printed_s
+            if time.monotonic() - printed_s > 10:
+                printed_s = time.monotonic()
                 print(f"{title}: {done} of {total} {unit}{note and f', {note}'}", file=sys.stderr)
 
         return advance

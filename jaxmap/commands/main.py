@@ -1,4 +1,4 @@
-"""The command line: finds the command, runs it, and turns errors into one line and an exit status."""
+"""The command line: finds and runs the command; an error becomes one line and an exit status."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from jaxmap.errors import JaxmapError
 from jaxmap.host.memory import restart_with_lasting_memory
 
 LASTING_MEMORY = ("train", "tune", "segment", "map", "demo")
-"""Commands that take and give back the memory of a network at every step: gigabytes in training, hundreds of MiB where
-images are labelled, a sixth of whose time it took to fetch them anew."""
+"""Commands that allocate and free the memory of a network at every step: gigabytes in training, hundreds of MiB where
+images are labelled. Fetching it anew from the system took a sixth of the time of labelling."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `jaxmap COMMAND ...`.
 
     Returns:
-        0; 2 for a wrong command line or configuration; 1 for anything else; 130 when interrupted.
+        0; 2 for a wrong command line or configuration; 1 for any other error; 130 when interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
@@ -33,30 +33,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxmap {__version__}")
         return 0
     if words[0] not in COMMANDS:
-        _say(f"error: there is no command {words[0]!r}; choose one of {', '.join(COMMANDS)}")
+        _print_error(f"there is no command {words[0]!r}; choose one of {', '.join(COMMANDS)}")
         return 2
     if arguments is None and words[0] in LASTING_MEMORY:
         restart_with_lasting_memory()
     try:
         command = importlib.import_module(f"jaxmap.commands.{words[0]}")
-        return command.main(words[1:]) or 0
+        status = command.main(words[1:]) or 0
+        # Here, so that a closed pipe is noticed before Python exits.
+        sys.stdout.flush()
+        return status
     except JaxmapError as error:
         if debug:
             raise
-        _say(f"error: {error}")
+        _print_error(f"{error}")
         return error.exit_code
     except KeyboardInterrupt:
-        _say("error: interrupted")
+        _print_error("interrupted")
         return 130
     except BrokenPipeError:
-        # The reader of our output has gone; Python must not complain about it at exit.
+        # The reader of our output has closed the pipe; Python must not complain about it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
         if debug:
             raise
         what = " ".join(str(error).split())[:300] or "no message"
-        _say(f"error: {type(error).__name__}: {what}; this is a fault of jaxmap: --debug shows where")
+        _print_error(f"{type(error).__name__}: {what}; this is a fault of jaxmap: --debug shows the traceback")
         return 1
 
 
@@ -72,13 +75,13 @@ def _overview() -> str:
             "commands:",
             *lines,
             "",
-            "jaxmap COMMAND --help says more; --debug shows the traceback of an error.",
+            "jaxmap COMMAND --help describes a command; --debug shows the traceback of an error.",
         ]
     )
 
 
-def _say(line: str) -> None:
-    print(line, file=sys.stderr)
+def _print_error(line: str) -> None:
+    print(f"error: {line}", file=sys.stderr)
 
 
 if __name__ == "__main__":

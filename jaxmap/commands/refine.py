@@ -7,57 +7,58 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from annotated_types import Interval, MinLen
 
-from jaxmap.commands.console import Console, parse
-from jaxmap.errors import UsageError
+from jaxmap.commands.console import Console, check_bounds, parse
 
-What = Literal["poses", "mounting", "baseline", "offset"]
+Adjustable = Literal["poses", "mounting", "baseline", "offset"]
+Positive = Annotated[float, Interval(gt=0, lt=1e4)]
 
 
 @dataclass(frozen=True)
 class RefineArguments:
-    """Refine the poses of a sequence, and on demand how its camera is mounted, its baseline and its disparity offset.
+    """Refine the poses of a sequence, and on request the camera's mounting, its baseline and its disparity offset.
 
     Patches of the ground are matched between frames, and a least-squares problem makes frames, points and priors agree.
-    What frames cannot tell by themselves (where the map as a whole lies; the camera's height) stays as given, unless
-    --dem or --ground-truth ties the map to the ground; report.html says what could be told. Writes poses.tum (for
-    jaxmap map --poses), refine.json, report.html, its pictures, and calibration.yaml (for jaxmap map --calibration)
-    where mounting, baseline or offset were refined.
+    What frames alone leave unobservable (where the map as a whole lies; the camera's height) keeps its given value,
+    unless --dem or --ground-truth ties the map to the ground; report.html says what was observable. Writes poses.tum
+    (for jaxmap map --poses), refine.json, report.html with its pictures, and calibration.yaml (for jaxmap map
+    --calibration) where mounting, baseline or offset were refined.
     """
 
     sequence: tyro.conf.Positional[str]
     """Folder of one sequence, or sample:traverse."""
     out: Path
     """Folder for the results; not the sequence's own folder."""
-    adjust: tuple[What, ...] = ("poses",)
-    """What may be wrong: poses (each by itself), mounting (the same displacement of the camera in every frame),
+    adjust: Annotated[tuple[Adjustable, ...], MinLen(1)] = ("poses",)
+    """What may be wrong: poses (each independently), mounting (the same displacement of the camera in every frame),
     baseline, offset (of disparity)."""
     ground_truth: tuple[Path, ...] = ()
-    """A labelled orthomosaic (GeoTIFF: 0 unlabelled, 1 sand, 2 rock) or lists of rocks: tells the place of the map to
-    some 0.1 m."""
+    """A labelled orthomosaic (GeoTIFF: 0 unlabelled, 1 sand, 2 rock) or lists of rocks: locates the map to some
+    0.1 m."""
     dem: Path | None = None
-    """An elevation model (GeoTIFF, metres, the height system of the poses): tells place, height and attitude to
-    centimetres and tenths of a degree."""
-    ground_below_camera_m: float | None = None
-    """How far below the given camera poses the ground lies that the rover drives over, by its drawings (Katwijk's
-    LocCam: 1.10): tells an error of the mounting's height from the height that the cameras see."""
-    sigma_position_m: float | None = None
-    """How wrong the given positions may be, each frame and axis, one sigma; by default told from the data."""
-    sigma_angle_deg: float | None = None
-    """How wrong the given attitudes may be, likewise."""
-    sigma_mounting_m: float = 0.1
-    """How far the camera may sit from where it should, each axis."""
-    sigma_mounting_deg: float = 2.0
-    """How far it may be turned, each axis."""
-    sigma_baseline: float = 0.01
-    """How wrong the baseline may be, as a share of it."""
-    sigma_offset_px: float = 0.5
-    """How wrong the disparity offset may be."""
-    max_depth_m: float | None = None
-    """Farther points do not count; by default where depth noise reaches 0.35 m."""
+    """An elevation model (GeoTIFF, metres, the height system of the poses): determines position, height and attitude
+    to centimetres and tenths of a degree."""
+    ground_below_camera_m: Positive | None = None
+    """Height of the given camera poses above the ground that the rover drives over, by its drawings (Katwijk's LocCam:
+    1.10): makes an error of the mounting's height observable."""
+    sigma_position_m: Positive | None = None
+    """Standard deviation of the given positions, each frame and axis; estimated from the data by default."""
+    sigma_angle_deg: Positive | None = None
+    """Standard deviation of the given attitudes, likewise."""
+    sigma_mounting_m: Positive = 0.1
+    """Standard deviation of the camera's position in its mounting, each axis."""
+    sigma_mounting_deg: Positive = 2.0
+    """Standard deviation of its attitude in the mounting, each axis."""
+    sigma_baseline: Positive = 0.01
+    """Standard deviation of the baseline, as a share of it."""
+    sigma_offset_px: Positive = 0.5
+    """Standard deviation of the disparity offset."""
+    max_depth_m: Positive | None = None
+    """Farther points are not used; by default those whose depth noise exceeds 0.35 m."""
     dataset: str = "auto"
     """The reader: auto, kitti, euroc, folder or katwijk."""
     poses: Path | None = None
@@ -74,31 +75,31 @@ class RefineArguments:
     """The same as a YAML file of CODE: CLASS."""
     truth_crs: str | None = None
     """Coordinate reference system of the ground truth, in place of its own."""
-    max_pose_gap_s: float = 1.0
-    """Poses farther apart are not bridged."""
+    max_pose_gap_s: Positive = 1.0
+    """Poses farther apart are not interpolated."""
     start: int = 0
     """First frame."""
     stop: int | None = None
     """Frame to stop before, from the end if negative; by default the end."""
     stride: int = 1
-    """Take every so many frames."""
+    """Use every n-th frame."""
     overwrite: bool = False
-    """Replace a refinement that lies in the folder."""
+    """Replace an earlier refinement in the folder."""
 
 
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(RefineArguments, "refine", words)
-    _check(arguments)
+    check_bounds(arguments, "refine")
 
     from jaxmap.datasets import ReadOptions
     from jaxmap.datasets.label_raster import choose_coding
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.runs.evaluation import TruthOptions
-    from jaxmap.runs.refinement import CALIBRATION, OUTPUTS, GroundFiles, check_apart, run_refine
+    from jaxmap.runs.refinement import CALIBRATION, OUTPUTS, GroundFiles, check_inputs_apart, run_refine
 
     keep_compiled_programs()
-    # What ends a job is told like Ctrl-C; the best so far lies in the folder.
+    # A job that is ended (SIGTERM) stops as with Ctrl-C; the best result so far is in the folder.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     options = ReadOptions(
@@ -113,7 +114,7 @@ def main(words: Sequence[str]) -> int:
         stride=arguments.stride,
     )
     inputs = (arguments.poses, arguments.calibration, arguments.dem, arguments.palette, *arguments.ground_truth)
-    check_apart(arguments.sequence, arguments.out, inputs)
+    check_inputs_apart(arguments.sequence, arguments.out, inputs)
     truth = TruthOptions(coding=choose_coding(arguments.remap, arguments.palette), crs=arguments.truth_crs)
     files = GroundFiles(arguments.ground_truth, truth, arguments.dem, arguments.ground_below_camera_m)
     with console.steps("refining", "steps", 100) as advance:
@@ -128,17 +129,17 @@ def main(words: Sequence[str]) -> int:
             advance=lambda share, note: advance(round(100 * share), note),
             notify=console.notify,
         )
-    _print(console, content)
+    _print_results(console, content)
     written = (*OUTPUTS, CALIBRATION) if set(arguments.adjust) - {"poses"} else OUTPUTS
     console.result(arguments.out, written)
     return 0
 
 
 def _prior(arguments: RefineArguments) -> Any:
-    from jaxmap.refinement.solve import Prior
+    from jaxmap.refinement.solver import Prior
 
-    def sigma(what: What, value: float) -> float:
-        return value if what in arguments.adjust else 0.0
+    def sigma(adjusted: Adjustable, value: float) -> float:
+        return value if adjusted in arguments.adjust else 0.0
 
     poses = "poses" in arguments.adjust
     position_m, angle_deg = arguments.sigma_position_m, arguments.sigma_angle_deg
@@ -152,51 +153,27 @@ def _prior(arguments: RefineArguments) -> Any:
     )
 
 
-def _check(arguments: RefineArguments) -> None:
-    """Refuses options without meaning.
-
-    Raises:
-        UsageError: a number is out of range, or nothing is to be refined.
-    """
-    if not arguments.adjust:
-        raise UsageError("nothing is to be refined", where="--adjust", fix="name poses, mounting, baseline or offset")
-    numbers = {
-        "--sigma-position-m": arguments.sigma_position_m,
-        "--sigma-angle-deg": arguments.sigma_angle_deg,
-        "--sigma-mounting-m": arguments.sigma_mounting_m,
-        "--sigma-mounting-deg": arguments.sigma_mounting_deg,
-        "--sigma-baseline": arguments.sigma_baseline,
-        "--sigma-offset-px": arguments.sigma_offset_px,
-        "--max-depth-m": arguments.max_depth_m,
-        "--ground-below-camera-m": arguments.ground_below_camera_m,
-        "--max-pose-gap-s": arguments.max_pose_gap_s,
-    }
-    for option, value in numbers.items():
-        if value is not None and not (math.isfinite(value) and 0 < value < 1e4):
-            raise UsageError(f"{value} is out of range", where=option, fix="give a number above 0")
-
-
-def _print(console: Console, content: dict[str, Any]) -> None:
+def _print_results(console: Console, content: dict[str, Any]) -> None:
     spread, residual, matches = content["map_height_spread_m"], content["match_residual_px"], content["matches"]
     console.notify(
-        f"{matches['count']:,} matches in {matches['pairs']} pairs of frames, off by {residual['before']:.2f} px "
-        f"before and {residual['after']:.2f} px now; between frames heights differ by {100 * spread['before']:.1f} cm "
-        f"before and {100 * spread['after']:.1f} cm now"
+        f"{matches['count']:,} matches in {matches['pairs']} pairs of frames; median residual "
+        f"{residual['before']:.2f} px before, {residual['after']:.2f} px after; heights differ between frames by "
+        f"{100 * spread['before']:.1f} cm before, {100 * spread['after']:.1f} cm after"
     )
     for note in content["notes"]:
         console.notify(f"note: {note}")
     rows = [
         {"group": group, **{key: row[key] for key in ("name", "value", "sigma", "prior_sigma")}}
-        | {"told": "yes" if row["observable"] else "no: as given"}
+        | {"observable": "yes" if row["observable"] else "no: prior kept"}
         for group, key in (("refined", "parameters"), ("whole map", "whole_map"))
         for row in content[key]
     ]
     columns = {
         "group": "",
-        "name": "number",
+        "name": "parameter",
         "value": "found",
         "sigma": "+- 1 sigma",
-        "prior_sigma": "given +- 1 sigma",
-        "told": "told by the data",
+        "prior_sigma": "prior +- 1 sigma",
+        "observable": "observable",
     }
-    console.table("what was found, and what could be told", columns, rows)
+    console.table("what was refined, and how certain it is", columns, rows)

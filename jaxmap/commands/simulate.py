@@ -5,49 +5,52 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from jaxmap.commands.console import Console, parse
-from jaxmap.errors import UsageError
+from annotated_types import Interval
+
+from jaxmap.commands.console import Console, check_bounds, parse
+
+Edge = Annotated[int, Interval(ge=16, le=8192)]
 
 
 @dataclass(frozen=True)
 class SimulateArguments:
-    """Render a rover's traverse in the layout of the Katwijk data set, with all that is true of it.
+    """Render a rover's traverse in the layout of the Katwijk data set, with its ground truth.
 
-    Part1/ holds the raw stereo images and the files of the sensors; gt/ holds poses, labels, depth,
-    orthomosaic, labelled orthomosaic and heights. The same seed and options give the same files; a
-    run that was interrupted goes on where it stopped. Needs Mitsuba (pip install 'jaxmap[sim]').
+    Part1/ holds the raw stereo images and the files of the sensors; gt/ holds poses, labels, depth, orthomosaic,
+    labelled orthomosaic and heights. The same seed and options give the same files; an interrupted run resumes where
+    it stopped. Needs Mitsuba (pip install 'jaxmap[sim]').
     """
 
     out: Path
     """Folder to write."""
-    seed: int = 0
+    seed: Annotated[int, Interval(ge=0, lt=2**31)] = 0
     """Seed of the world and of all noise."""
     scene: Literal["few", "small", "medium", "random"] = "random"
-    """Few big rocks; many small, flat ones; medium ones with the rover's shadow in view; or anything."""
-    frames: int = 14
-    """Stereo pairs."""
-    step_m: float = 0.4
+    """Few big rocks; many small, flat ones; medium ones with the rover's shadow in view; or any of these."""
+    frames: Annotated[int, Interval(ge=1, le=10_000)] = 14
+    """Number of stereo pairs."""
+    step_m: Annotated[float, Interval(ge=0.01, le=10)] = 0.4
     """Distance between them, in metres."""
-    samples: int | None = None
-    """Rays per pixel: more take longer and leave less grain (8; 4 for training images)."""
-    width: int = 1024
-    """Width of the images in pixels; calibration.yaml tells the camera that belongs to it."""
-    map_cell_m: float = 0.02
-    """Cells of the orthomosaic, in metres."""
+    samples: Annotated[int, Interval(ge=1, le=4096)] | None = None
+    """Rays per pixel: more take longer and leave less noise (8; 4 for training images)."""
+    width: Annotated[int, Interval(ge=32, le=8192)] = 1024
+    """Width of the images in pixels; calibration.yaml describes the camera of that size."""
+    map_cell_m: Annotated[float, Interval(ge=0.005, le=1)] = 0.02
+    """Cell size of the orthomosaic, in metres."""
     preview: bool = False
     """Small and quick: images of 320 pixels, 4 rays per pixel, a coarse ground and orthomosaic."""
-    training: int | None = None
-    """Write so many single views, each of another world, as images/ and masks/ for jaxmap train instead."""
-    size: tuple[int, int] = (384, 512)
+    training: Annotated[int, Interval(ge=1, le=1_000_000)] | None = None
+    """Write so many single images, each of another world, as images/ and masks/ for jaxmap train instead."""
+    size: tuple[Edge, Edge] = (384, 512)
     """Height and width of the training images."""
 
 
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(SimulateArguments, "simulate", words)
-    _check(arguments)
+    check_bounds(arguments, "simulate")
     return _training(arguments) if arguments.training is not None else _traverse(arguments)
 
 
@@ -97,26 +100,3 @@ def _training(arguments: SimulateArguments) -> int:
         console.notify(f"{image_s:.1f} s per image")
     console.result(arguments.out, ["images/", "masks/", "train.txt", "val.txt", "worlds/"])
     return 0
-
-
-def _check(arguments: SimulateArguments) -> None:
-    """Refuses what cannot be rendered.
-
-    Raises:
-        UsageError: a number is out of range.
-    """
-    limits = {
-        "--seed": (arguments.seed, 0, 2**31 - 1),
-        "--frames": (arguments.frames, 1, 10_000),
-        "--step-m": (arguments.step_m, 0.01, 10.0),
-        "--samples": (arguments.samples, 1, 4096),
-        "--width": (arguments.width, 32, 8192),
-        "--map-cell-m": (arguments.map_cell_m, 0.005, 1.0),
-        "--training": (arguments.training, 1, 1_000_000),
-        "--size": (min(arguments.size), 16, 8192),
-    }
-    for option, (value, least, most) in limits.items():
-        if value is not None and not least <= value <= most:
-            raise UsageError(f"{value} is out of range", where=option, fix=f"give {least} to {most}")
-    if max(arguments.size) > 8192:
-        raise UsageError(f"{max(arguments.size)} is out of range", where="--size", fix="give 16 to 8192")

@@ -1,4 +1,4 @@
-"""The cache folder: compiled programs are kept there from run to run."""
+"""The cache folder, where compiled programs are kept between runs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ def cache_folder() -> Path:
 
 
 def keep_compiled_programs(*, scopes: bool = False) -> None:
-    """Lets JAX keep what it compiles, so that a second run of the same kind starts at once.
+    """Turns on JAX's persistent compilation cache, so that a second run of the same kind starts at once.
 
     Args:
-        scopes: take a kept program only where the names of its stages are those of this code, too, as a profile needs
-            them; otherwise names do not matter.
+        scopes: use a kept program only if the names of its stages match too, which a profile needs.
     """
     import jax
 
@@ -26,10 +25,10 @@ def keep_compiled_programs(*, scopes: bool = False) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        # Without a place to keep them, programs are compiled anew each time.
+        # Without the folder, programs are compiled in every run.
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_include_metadata_in_key", scopes)
-    # All of them: a start compiles dozens of small programs, too, and each costs as much as a large one is to load.
+    # Small programs too: a start has dozens of them, and compiling one takes as long as loading a large one.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

@@ -1,4 +1,4 @@
-"""Where bundled files lie, and writing so that a crash or a full disk leaves either the old content or the new."""
+"""Bundled files, and atomic writing: after a crash or on a full disk, a file has its old content or the new one."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def bundled(name: str) -> Path:
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside `path`, which replaces it when the block ends well.
+    """A temporary path beside `path`, which replaces it when the block ends without an error.
 
-    The temporary file keeps the suffix, so that writers which go by it still do. Missing parent
-    folders are made. When the block raises, the temporary file is removed and `path` stays as it was.
+    The temporary file keeps the suffix, which some writers take the format from. Missing parent folders are created.
+    When the block raises, the temporary file is removed and `path` keeps its content.
 
     Raises:
         JaxmapError: the operating system refused (disk full, no permission, ...).
@@ -61,7 +61,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _remove_strays(target: Path) -> None:
-    """Removes what processes that were killed while writing the same file have left."""
+    """Removes temporary files of processes that were killed while writing the same file."""
     for stray in target.parent.glob(f".{glob.escape(target.stem)}.tmp-*{glob.escape(target.suffix)}"):
         process = stray.name.removeprefix(f".{target.stem}.tmp-").removesuffix(target.suffix)
         if process.isdecimal() and not _is_alive(int(process)):
@@ -84,7 +84,7 @@ def sync(path: Path) -> None:
     try:
         os.fsync(handle)
     except OSError as error:
-        # Some file systems cannot sync a folder; that is no reason to fail.
+        # Some file systems cannot sync a folder.
         if error.errno != errno.EINVAL:
             raise
     finally:
@@ -104,7 +104,7 @@ def remove(path: Path) -> None:
 
 
 def write_error(error: OSError, where: object) -> JaxmapError:
-    """What went wrong while writing `where`, as an error that says what to do."""
+    """An error for a failure of the operating system while writing `where`."""
     if error.errno in _FULL:
         return JaxmapError("disk full", where=where, fix="free some space or write to another disk")
     if error.errno in _REFUSED:

@@ -1,4 +1,4 @@
-"""The memory of the process: how it is given (in large pages, and for good, for long work), and how much it took."""
+"""Memory of the process: allocation in large pages that are kept for reuse, and the peak resident size."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 
 _TUNABLES = "GLIBC_TUNABLES"
 _SETTINGS = {
-    # Pages of 2 MiB, where the system grants them to those who ask.
+    # Pages of 2 MiB, where the system grants them on request.
     "glibc.malloc.hugetlb": "1",
-    # Nothing is handed back to the system: neither large blocks, which otherwise come and go by themselves, nor the
-    # end of the heap; and there is one heap for all threads, as others cannot hold large blocks.
+    # Nothing is returned to the system: neither large blocks, which are otherwise mapped and unmapped one by one, nor
+    # the end of the heap. All threads share one arena, as other arenas cannot hold large blocks.
     "glibc.malloc.mmap_max": "0",
     "glibc.malloc.trim_threshold": str(1 << 62),
     "glibc.malloc.arena_max": "1",
@@ -22,14 +22,14 @@ _SINCE = (2, 26)
 
 
 def restart_with_lasting_memory() -> None:
-    """Starts this process again, under the same number, so that the C library keeps the memory it was given.
+    """Restarts this process, under the same process ID, with an allocator that keeps freed memory for reuse.
 
-    A training step takes gigabytes and frees them at its end. Handed back and fetched anew, zeroed by the system page
-    by page, they take as long as the step's own work. The library reads these settings only when a process starts;
-    where it is not glibc, or the user has set one of them, nothing happens.
+    A training step allocates gigabytes and frees them at its end. Returned to the system and fetched again, zeroed
+    page by page, they take as long as the step's own work. glibc reads these settings only when a process starts;
+    with another C library, or where the user has set one of them, nothing happens.
     """
     settings = os.environ.get(_TUNABLES, "")
-    if any(name in settings for name in _SETTINGS) or not _understood():
+    if any(name in settings for name in _SETTINGS) or not _is_supported():
         return
     settings = ":".join([*filter(None, [settings]), *(f"{name}={value}" for name, value in _SETTINGS.items())])
     sys.stdout.flush()
@@ -37,9 +37,9 @@ def restart_with_lasting_memory() -> None:
 
 
 def peak_resident_mib() -> float:
-    """The greatest resident size of this program so far.
+    """The peak resident size of this program so far, in MiB.
 
-    Linux tells it of the program itself. `getrusage`, which every Unix has, also counts the process that started it.
+    Linux reports it for the program itself; `getrusage`, the fallback, also counts the process that started it.
     """
     status = Path("/proc/self/status")
     if status.exists():
@@ -51,7 +51,8 @@ def peak_resident_mib() -> float:
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def _understood() -> bool:
+def _is_supported() -> bool:
+    """Whether the C library is a glibc that has these settings."""
     library, version = platform.libc_ver()
     try:
         return library == "glibc" and tuple(map(int, version.split("."))) >= _SINCE

@@ -1,4 +1,4 @@
-"""The folder a run writes: kept from other runs, with the settings it was begun with."""
+"""The folder a run writes: locked against other runs, with the settings it was started with."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from jaxmap.host.files import atomic_path, write_error
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keeps other runs out of a folder, which is made where it is missing.
+    """Locks a folder against other runs; it is created where it is missing.
 
-    A folder that was made for a run which then wrote nothing is removed again.
+    A folder that was created for a run that then wrote nothing is removed.
 
     Raises:
         JaxmapError: another run is writing into it, or it cannot be made or written.
@@ -27,46 +27,38 @@ def locked(folder: Path) -> Iterator[None]:
     made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # The folder itself is locked, so that no lock file is left behind.
+        # The folder itself is locked: no lock file can be left behind.
         handle = os.open(folder, os.O_RDONLY)
     except OSError as error:
         reason = "it is a file" if folder.is_file() else error.strerror
         raise JaxmapError(f"cannot be made: {reason}", where=folder, fix="choose another --out") from error
     try:
-        _lock(handle, folder)
-        _check_writable(folder)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise JaxmapError(
+                "another run is writing here", where=folder, fix="wait for it, or choose another --out"
+            ) from error
+        # A folder that cannot be written is refused before the work, not after it.
+        try:
+            with TemporaryFile(dir=folder):
+                pass
+        except OSError as error:
+            raise write_error(error, folder) from error
         yield
     finally:
         if made:
-            # Refused by the system where something lies in it.
+            # Fails where the folder is not empty.
             with suppress(OSError):
                 folder.rmdir()
         os.close(handle)
 
 
-def _lock(handle: int, folder: Path) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        raise JaxmapError(
-            "another run is writing here", where=folder, fix="wait for it, or choose another --out"
-        ) from error
-
-
-def _check_writable(folder: Path) -> None:
-    """Tells before the work what would be told only after it."""
-    try:
-        with TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise write_error(error, folder) from error
-
-
 def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
-    """Refuses to write over what is read.
+    """Refuses outputs that would overwrite an input.
 
     Raises:
-        UsageError: an output lies where an input does.
+        UsageError: an output has the path of an input.
     """
     read = {path.resolve() for path in inputs if path is not None}
     for path in outputs:
@@ -75,7 +67,7 @@ def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) ->
 
 
 def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
-    """Compares the settings that a run was begun with to those of now.
+    """Compares the current settings with those that a run was started with.
 
     Raises:
         JaxmapError: the file cannot be read.
@@ -99,7 +91,7 @@ def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
 
 
 def _dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A tree of settings as one level, with dotted keys."""
+    """A tree of settings flattened to dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         flat |= _dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}

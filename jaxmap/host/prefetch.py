@@ -1,4 +1,4 @@
-"""Work that runs ahead in threads, in order and bounded."""
+"""Mapping a function over items in threads, ahead of their use: in order and bounded."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Out = TypeVar("Out")
 def prefetch(function: Callable[[In], Out], items: Iterable[In], workers: int, ahead: int) -> Iterator[Out]:
     """Maps a function over items in threads, in order.
 
-    The first items are begun at once, before a result is asked for. From then on an item is begun whenever a result is
-    taken: results that nobody has taken yet are never more than `ahead`, in the making or waiting, however slow the
-    consumer is. What the function raises is raised where the item's result would stand, and ends it all.
+    The first items are started at once, before a result is asked for; after that one item is started for each result
+    taken. At most `ahead` results are in progress or waiting, however slow the consumer is. An exception of the
+    function is raised in place of the item's result, and ends the iteration.
 
     Args:
         function: called in the threads.
-        items: read as far as needed, in the thread of the consumer.
-        workers: threads.
+        items: consumed as needed, in the thread of the consumer.
+        workers: number of threads.
         ahead: at least 1.
     """
     source = iter(items)
@@ -37,10 +37,10 @@ def _in_order(
     try:
         while pending:
             wait((pending[0],))
-            # The result that is taken gets no name here: it would live on while the next one is waited for.
+            # The result gets no name here: a reference would keep it alive while the next one is waited for.
             pending.extend(pool.submit(function, item) for item in islice(source, 1))
             yield pending.popleft().result()
     finally:
-        # Not waited for: the garbage collector may close this generator in one of the pool's own threads,
-        # which would wait for itself for ever.
+        # Without waiting: the garbage collector may close this generator in one of the pool's own threads,
+        # which would then wait for itself.
         pool.shutdown(wait=False, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Stages of the host's work: timed, and marked in the trace where one is being recorded."""
+"""Stages of the work on the host: timed, and marked in a trace that is being recorded."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax
 
 @contextmanager
 def timed_stage(name: str, stages_s: dict[str, float]) -> Iterator[None]:
-    """Times a block, in seconds, under its name; `jax.profiler` traces show it under the same."""
+    """Times a block in seconds, under a name that `jax.profiler` traces show too."""
     started_s = time.perf_counter()
     with jax.profiler.TraceAnnotation(name):
         yield

@@ -1,1 +1,1 @@
-"""Where the time of a run goes: traces of its steps, told by the stages of the algorithm."""
+"""Where the time of a run goes: traces of its steps, summed by the stages of the algorithm."""

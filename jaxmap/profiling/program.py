@@ -1,4 +1,4 @@
-"""What each operation of a compiled program belongs to, computes and moves, read from the program's text.
+"""The stage, the arithmetic and the memory traffic of each operation of a compiled program, read from its text.
 
 XLA keeps the `jax.named_scope` that an operation comes from as its `op_name`, through fusion and scheduling; traces
 name operations but not their scopes. The text has both.
@@ -19,16 +19,18 @@ STAGES = (
 """The named scopes of the step, in its order."""
 
 OTHER = "other"
-"""What stands in none of them."""
+"""Operations outside all of them."""
 
 _CONTAINERS = {"while", "call", "conditional", "async-start", "async-done"}
-"""Operations that only run others, which are told by themselves."""
+"""Operations that only run others, which are counted themselves."""
 
 _FREE = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all", "iota", "partition-id"}
 _MOVES = {
     *("copy", "reshape", "transpose", "broadcast", "slice", "concatenate", "pad", "reverse", "gather", "select"),
     *("dynamic-slice", "dynamic-update-slice", "convert", "custom-call", "fusion", "copy-start", "copy-done", "sort"),
 }
+
+_SLICES = {"dynamic-slice", "gather", "slice"}
 
 _INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%(?P<name>[\w.\-]+) = (?P<type>\(.*?\)|\S+) (?P<opcode>[\w\-]+)\(")
 _COMPUTATION = re.compile(r"^(?:ENTRY )?%(?P<name>[\w.\-]+) \(.*\{$")
@@ -41,7 +43,7 @@ class Operation(NamedTuple):
 
     Attributes:
         stage: one of `STAGES`, or `OTHER`.
-        flops: arithmetic operations, one for each element of each elementwise one; 2 for a multiply and add.
+        flops: arithmetic operations, one for each element of an elementwise one; 2 for a multiply and add.
         bytes: read and written, every operand and the result once; of what is changed in place only the changed part.
     """
 
@@ -61,7 +63,7 @@ class _Instruction(NamedTuple):
 
 
 def read_program(text: str, stages: Sequence[str] = STAGES) -> dict[str, Operation]:
-    """The operations of a compiled program (`jax.stages.Compiled.as_text`) by the names that traces give them.
+    """The operations of a compiled program (`jax.stages.Compiled.as_text`), by their names in traces.
 
     Operations that do nothing but run others (loops, calls) are left out.
     """
@@ -133,7 +135,7 @@ def _called(one: _Instruction) -> str | None:
 
 
 def _stage(one: _Instruction, inner: Sequence[_Instruction], stages: Sequence[str]) -> str:
-    """The operation's own stage, or else that of most of what is fused in it."""
+    """The operation's own stage, or else that of most operations fused in it."""
     own, *parts = (_op_name(part) for part in (one, *inner))
     if stage := stage_of(own, stages):
         return stage
@@ -164,12 +166,12 @@ def _flops(one: _Instruction, by_name: Mapping[str, _Instruction]) -> float:
 
 
 def _bytes(one: _Instruction, by_name: Mapping[str, _Instruction]) -> float:
-    """Operands and result, unless most of one of them is left alone."""
+    """Operands and result, unless most of one of them is not touched."""
     operands = [by_name[name] for name in one.operands if name in by_name]
     if one.opcode == "dynamic-update-slice":
         return 2.0 * operands[1].bytes
     if one.opcode == "scatter":
-        # What is hit is read and written; indices and updates are read.
+        # Updated elements are read and written; indices and updates are read.
         return sum(part.bytes for part in operands[1:]) + 2.0 * operands[-1].bytes
     if one.opcode in ("dynamic-slice", "gather", "slice"):
         return 2.0 * one.bytes + sum(part.bytes for part in operands[1:])
@@ -194,6 +196,3 @@ def _fusion_bytes(one: _Instruction, inner: Sequence[_Instruction], by_name: Map
         whole = len(sliced) < len(users)
         total += parameter.bytes if whole else min(parameter.bytes, sum(part.bytes for part in sliced))
     return total
-
-
-_SLICES: set[str] = {"dynamic-slice", "gather", "slice"}

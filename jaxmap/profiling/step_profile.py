@@ -1,43 +1,51 @@
-"""A trace of some steps, and where their time went: stage by stage, against what the machine reaches."""
+"""A profile of the step: the time of each stage, from a recorded trace, compared with the peaks of the machine."""
 
 from __future__ import annotations
 
 import statistics
+import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+from jax.profiler import ProfileData
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import write_error
-from jaxmap.profiling.peaks import Peaks, measure_peaks
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program
-from jaxmap.profiling.trace import OperationTimes, read_operation_times
 
 WARM_UP_FRAMES = 3
-"""Frames before the trace begins: the first ones fetch memory, and fill caches."""
+"""Frames before the trace begins: the first ones allocate memory and fill caches."""
 
 TRACED_FRAMES = 10
+
+OperationTimes = dict[str, list[float]]
+"""Seconds of each execution of an operation, by its name."""
+
+_COPIED = 1 << 25
+_EDGE = 2048
+_REPEATS = 7
 
 
 class StepProfile:
     """Records a trace of a few steps of a run, after the first ones.
 
-    Notify it of each step that was made (`step_done`), and close it when no more come.
+    Call `step_done` after each step, and `close` when no more come.
 
     Attributes:
-        steps: how many were made; those after the first `WARM_UP_FRAMES` are traced.
+        steps: how many were done; those after the first `WARM_UP_FRAMES` are traced.
     """
 
     def __init__(self, folder: Path | None) -> None:
-        """Nothing is recorded yet; the trace goes into `folder`, for TensorBoard (XProf) or Perfetto; None: none is."""
+        """The trace goes into `folder`, for TensorBoard (XProf) or Perfetto; None records nothing."""
         self._folder = folder
         self.steps, self._recording = 0, False
 
     def step_done(self) -> None:
-        """One more step was made: the trace may begin or end here."""
+        """Counts a step; the trace may begin or end here."""
         self.steps += 1
         if self.steps == WARM_UP_FRAMES and self._folder is not None:
             self._start()
@@ -58,10 +66,10 @@ class StepProfile:
                 raise write_error(error, Path(str(self._folder))) from error
 
     def summary(self, program: Callable[[], str | None] | None) -> dict[str, Any] | None:
-        """Where the time of the steps went (`stage_table`), and what the machine reaches; None if nothing was traced.
+        """The stages of the steps (`stage_table`) and the peaks of the machine; None if nothing was traced.
 
         Args:
-            program: gives the text of the step's program, where the backend has one; None where no step was compiled.
+            program: returns the text of the step's program, where the backend has one; None where no step was compiled.
 
         Raises:
             JaxmapError: the trace cannot be read.
@@ -82,7 +90,7 @@ class StepProfile:
 
     def _start(self) -> None:
         options = jax.profiler.ProfileOptions()
-        # Python's own calls would be most of the trace, and take most of the time.
+        # Python's own calls would fill most of the trace and take most of the time.
         options.python_tracer_level = 0
         try:
             jax.profiler.start_trace(str(self._folder), profiler_options=options)
@@ -94,20 +102,20 @@ class StepProfile:
 def stage_table(
     operations: Mapping[str, Operation], runs: Sequence[OperationTimes], peaks: Peaks
 ) -> dict[str, dict[str, Any]]:
-    """Each stage's share of the steps, and how near it comes to what the machine reaches.
+    """Each stage's share of the steps, and how close it comes to the peaks of the machine.
 
-    An operation's time is that from its begin to its end. Where operations run side by side their times add up to more
+    An operation's time is that from its start to its end. Where operations run side by side their times add up to more
     than the step's.
 
     Args:
         operations: of the program (`read_program`).
         runs: the times of each run of it.
-        peaks: what the machine reaches.
+        peaks: of the machine.
 
     Returns:
         For each stage, in the order of the step: `median_ms` over the runs, `share` of the sum of all, `operations`,
         `mb` and `mflop` a frame, `gb_per_s` and `gflop_per_s` while it runs, and `bound`: `memory` or `arithmetic`,
-        the peak that it comes nearer to, or `overhead` where it comes within a tenth of neither.
+        the peak that it comes closer to, or `overhead` where it stays below a tenth of both.
     """
     rows: dict[str, dict[str, Any]] = {}
     in_order = [*STAGES, OTHER]
@@ -162,3 +170,57 @@ def table_lines(summary: Mapping[str, Any]) -> list[str]:
         f"{summary['matmul_gflop_per_s']:.0f} GFLOP/s; {summary['device']}, median of {summary['frames']} frames"
     )
     return lines
+
+
+class Peaks(NamedTuple):
+    """Peak rates of a machine, per second: bytes of a copy, read and written, and operations of a float32 product."""
+
+    bytes_per_s: float
+    flops_per_s: float
+
+
+def measure_peaks() -> Peaks:
+    """Negates 128 MiB in place, more than caches hold; multiplies 2048 x 2048 matrices: each the median of seven."""
+    # In place: allocating fresh memory takes longer than filling it.
+    negate = jax.jit(jnp.negative, donate_argnums=0)
+    values, matrix = jnp.ones(_COPIED, jnp.float32), jnp.ones((_EDGE, _EDGE), jnp.float32)
+    copied_s = _median_s(negate, values, over=True)
+    product = jax.jit(lambda one: jnp.dot(one, one, precision=jax.lax.Precision.HIGHEST))
+    return Peaks(8 * _COPIED / copied_s, 2 * _EDGE**3 / _median_s(product, matrix, over=False))
+
+
+def _median_s(function: Callable[[jax.Array], jax.Array], argument: jax.Array, *, over: bool) -> float:
+    """How long a function takes; `over`: each call takes the result of the one before."""
+    result = function(argument).block_until_ready()
+    times_s = []
+    for _ in range(_REPEATS):
+        started_s = time.perf_counter()
+        result = function(result if over else argument).block_until_ready()
+        times_s.append(time.perf_counter() - started_s)
+    return statistics.median(times_s)
+
+
+def read_operation_times(folder: Path, module: str) -> list[OperationTimes]:
+    """The times of a program's operations in a trace, one entry for each run of the program, in order.
+
+    Args:
+        folder: where `jax.profiler` has written a trace.
+        module: the program's name, such as `jit_step`.
+
+    Raises:
+        JaxmapError: there is no trace.
+    """
+    files = sorted(folder.glob("plugins/profile/*/*.xplane.pb"))
+    if not files:
+        raise JaxmapError("no trace was written", where=folder, fix="give a folder that can be written to")
+    planes = list(ProfileData.from_file(str(files[-1])).planes)
+    # An accelerator has planes of its own; events of the host are then no operations.
+    planes = [plane for plane in planes if plane.name.startswith("/device:")] or planes
+    runs: dict[Any, OperationTimes] = defaultdict(lambda: defaultdict(list))
+    for plane in planes:
+        for line in plane.lines:
+            for event in line.events:
+                stats: dict[Any, Any] = dict(event.stats)
+                if stats.get("hlo_module") == module and "hlo_op" in stats:
+                    runs[stats.get("run_id")][stats["hlo_op"]].append(event.duration_ns / 1e9)
+    return [dict(times) for times in runs.values()]

@@ -1,4 +1,4 @@
-"""How sharp a map is: how much frames that see the same column differ in its height and its brightness."""
+"""Consistency of a map: how much frames that see the same column differ in its height and its brightness."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jaxmap.types import GridSpec, make_grid
 CELL_M = 0.1
 MAX_CELLS = 1_000_000
 ENOUGH_POINTS = 0.5
-"""A frame sees a column from so many points' worth of shares on."""
+"""A frame sees a column where the shares of its points sum to this."""
 
 
 class Consistency(NamedTuple):
     """Standard deviations between the frames that see a column, over the columns that two or more see.
 
     Attributes:
-        height_m, brightness: the median over the columns; their mean would tell of the edges of rocks alone.
+        height_m, brightness: the median over the columns; the mean would be dominated by the edges of rocks.
         spread_m: (X, Y) of the height in each column, NaN where fewer than two frames see it.
         grid: the columns, one voxel high.
     """
@@ -36,9 +36,9 @@ class Consistency(NamedTuple):
 def between_frames(
     grid: GridSpec, points_world: Float[Array, "N P 3"], values: Float[Array, "C N P"]
 ) -> tuple[Float[Array, "C X Y"], Float[Array, "X Y"]]:
-    """Variance between frames of the values that each of them gives a column, by the soft splat.
+    """Variance between frames of the mean value of each column, by the soft splat.
 
-    Differentiable in points and values: the gradient of its mean says which way the frames come to agree.
+    Differentiable in points and values: descent on its mean makes the frames agree.
 
     Args:
         grid: the columns.
@@ -68,18 +68,15 @@ def between_frames(
     return jnp.maximum(variance, 0.0), count
 
 
-_between_frames = jax.jit(between_frames)
-
-
 def consistency_of(
     points_world: Float[np.ndarray, "P 3"], brightness: Float[np.ndarray, "P"], frames: Int[np.ndarray, "P"]
 ) -> Consistency:
-    """How well frames agree where points of theirs lie.
+    """Consistency of frames, from their points in the world.
 
     Args:
         points_world: of all frames.
         brightness: of the pixel of each.
-        frames: which frame each is of.
+        frames: index of the frame of each.
     """
     lower, upper = points_world.min(axis=0), points_world.max(axis=0)
     cell_m = max(CELL_M, float(np.sqrt(np.prod((upper - lower)[:2]) / MAX_CELLS)))
@@ -93,11 +90,11 @@ def consistency_of(
         own = frames == frame
         points[frame, : own.sum()] = points_world[own] - lower
         values[:, frame, : own.sum()] = points[frame, : own.sum(), 2], brightness[own]
-    # Heights about their middle: their squares are subtracted from each other in float32.
+    # Heights are centred: their squares are subtracted from each other in float32.
     values[0] -= np.nanmedian(points[..., 2])
     variance, count = (
         np.asarray(part, np.float64)
-        for part in _between_frames(local, jnp.asarray(points, jnp.float32), jnp.asarray(values, jnp.float32))
+        for part in jax.jit(between_frames)(local, jnp.asarray(points, jnp.float32), jnp.asarray(values, jnp.float32))
     )
     several = count > 1
     middle = np.median(variance[:, several], axis=1) if several.any() else np.full(2, np.nan)

@@ -1,22 +1,24 @@
-"""The page of a refinement: how the frames agree before and after, where they went, and what the data could tell."""
+"""The page of a refinement: consistency before and after, the trajectory, and how certain each parameter is."""
 
 from __future__ import annotations
 
+import io
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxmap.host.files import atomic_path
-from jaxmap.refinement.consistency import Consistency
-from jaxmap.refinement.rounds import Refinement
-from jaxmap.report.charts import Chart, Mark, Series, line_chart
+from jaxmap.refinement.refine import Refinement
 from jaxmap.report.page import inline_image, page
 from jaxmap.report.wording import number_text
 
-SPREAD, TRAJECTORY = "consistency.png", "trajectory.png"
+CONSISTENCY, TRAJECTORY = "consistency.png", "trajectory.png"
+_BEFORE, _AFTER = "#d55e00", "#0072b2"
 _MAX_ROWS = 60
 
 
@@ -32,15 +34,15 @@ def write_refine_report(out: Path, name: str, state: Refinement, content: dict[s
     Raises:
         JaxmapError: the disk is full or refuses.
     """
-    _draw_consistency(out / SPREAD, state)
-    _draw_trajectory(out / TRAJECTORY, state)
-    style = files("jaxmap.report").joinpath("training_page.css").read_text(encoding="utf-8")
+    for file, figure in ((CONSISTENCY, _consistency_figure(state)), (TRAJECTORY, _trajectory_figure(state))):
+        with atomic_path(out / file) as temporary:
+            figure.savefig(temporary)
     sections = [
-        f"<style>{style}</style>",
         _header(name, content),
-        _picture(out / SPREAD, "How much frames differ in the height of a column, before and after"),
-        _picture(out / TRAJECTORY, "The cameras from above and from the side, before and after"),
-        _curve(state),
+        _picture(out / CONSISTENCY, "Spread of heights between frames, column by column, before and after"),
+        _picture(out / TRAJECTORY, "Camera positions, top-down and in height, before and after"),
+        '<section><h2>Median match residual, step by step</h2><div class="paper">'
+        f"{svg_of(_residual_figure(state), 'Median match residual, step by step')}</div></section>",
         _parameters("What was refined", content["parameters"]),
         _parameters("The map as a whole", content["whole_map"]),
         _frames(content),
@@ -59,16 +61,16 @@ def _header(name: str, content: dict[str, Any]) -> str:
         "pairs compared": content["matches"]["pairs"],
         "matches": content["matches"]["count"],
         "height spread, before": _length(spread["before"]),
-        "and after": _length(spread["after"]),
-        "matches off, before": f"{number_text(residual['before'])} px",
-        "and now": f"{number_text(residual['after'])} px",
+        "height spread, after": _length(spread["after"]),
+        "match residual, before": f"{residual['before']:.2f} px",
+        "match residual, after": f"{residual['after']:.2f} px",
     }
     body = "".join(f"<div><dt>{key}</dt><dd>{value}</dd></div>" for key, value in stats.items())
     return (
         f'<header><p class="kind">Refined poses</p><h1>{escape(name)}</h1><dl class="stats">{body}</dl></header>'
-        "<section><p>Matches between frames make the frames agree with each other. Where the map as a whole lies they "
-        "cannot tell: that stays with the given poses, unless an elevation model or labelled rocks say otherwise.</p>"
-        "</section>"
+        "<section><p>Matches determine how frames lie relative to each other. Where the map as a whole lies is "
+        "unobservable from them and stays with the given poses, unless an elevation model or labelled rocks tie the "
+        "map to the ground.</p></section>"
     )
 
 
@@ -80,28 +82,14 @@ def _picture(path: Path, caption: str) -> str:
     return f'<section><h2>{caption}</h2><div class="paper">{inline_image(path, caption)}</div></section>'
 
 
-def _curve(state: Refinement) -> str:
-    values = state.residuals_px
-    points = [(float(step), value) for step, value in enumerate(values)]
-    last = state.rounds[-1]
-    chart = Chart(
-        "Median distance of matches from where they should be, step by step",
-        "step",
-        "match residual, px",
-        mark=Mark(float(last[0]), last[1]) if 0 < last[0] < len(values) - 1 else None,
-    )
-    drawn = line_chart(chart, [Series("", points, "var(--accent)", strong=True)])
-    return f'<section><h2>Residual</h2><div class="tables"><figure>{drawn}</figure></div></section>'
-
-
 def _parameters(title: str, rows: list[dict[str, Any]]) -> str:
     if not rows:
         return ""
-    head = "".join(f'<th scope="col">{name}</th>' for name in ("", "found", "± 1 σ", "given ± 1 σ", "told by the data"))
+    head = "".join(f'<th scope="col">{name}</th>' for name in ("", "found", "± 1 σ", "prior ± 1 σ", "observable"))
     body = "".join(
         f'<tr><th scope="row">{escape(row["name"].replace("_", " "))}</th>'
         + "".join(f"<td>{number_text(row[key])}</td>" for key in ("value", "sigma", "prior_sigma"))
-        + f"<td>{'yes' if row['observable'] else 'no: as given'}</td></tr>"
+        + f"<td>{'yes' if row['observable'] else 'no: prior kept'}</td></tr>"
         for row in rows
     )
     return (
@@ -123,67 +111,79 @@ def _frames(content: dict[str, Any]) -> str:
         matched = "no" if index in alone else "yes"
         rows.append(f'<tr><th scope="row">{escape(name)}</th>{numbers}<td>{matched}</td></tr>')
     more = len(content["frames"]) - len(rows)
-    told = f"<p>and {more} more, in refine.json</p>" if more > 0 else ""
+    rest = f"<p>and {more} more, in refine.json</p>" if more > 0 else ""
     return (
-        '<section><h2>Frames</h2><details><summary>How far each went</summary><div class="list"><table>'
-        f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>{told}</details></section>"
+        '<section><h2>Frames</h2><details><summary>How far each frame was moved</summary><div class="list"><table>'
+        f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>{rest}</details></section>"
     )
 
 
 def _notes(content: dict[str, Any]) -> str:
-    told = [*content["notes"], *(f"skipped {one['frame']}: {one['reason']}" for one in content["skipped"])]
-    items = "".join(f"<li>{escape(str(note))}</li>" for note in told)
+    notes = [*content["notes"], *(f"skipped {one['frame']}: {one['reason']}" for one in content["skipped"])]
+    items = "".join(f"<li>{escape(str(note))}</li>" for note in notes)
     return f"<section><h2>Notes</h2><ul>{items}</ul></section>" if items else ""
 
 
-def _draw_consistency(path: Path, state: Refinement) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def svg_of(figure: Figure, title: str) -> str:
+    """A figure as an `<svg>` to put into a page; its text stays text."""
+    text = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": title}):
+        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+    svg = text.getvalue()
+    style = "display:block;margin:0 auto;max-width:100%;height:auto"
+    drawing = svg[svg.index("<svg ") + len("<svg ") :]
+    return f'<svg role="img" aria-label="{escape(title)}" style="{style}" {drawing}'
 
+
+def _residual_figure(state: Refinement) -> Figure:
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(state.residuals_px, "o-", color=_AFTER, markersize=3, linewidth=1.4)
+    for step, name in state.rounds:
+        axes.axvline(step, color="0.7", linewidth=0.8, linestyle=":")
+        place = (step + 0.15, 0.98)
+        axes.annotate(name, place, xycoords=("data", "axes fraction"), rotation=90, va="top", fontsize=7, color="0.4")
+    axes.set(xlabel="step", ylabel="match residual, px")
+    if min(state.residuals_px) > 0:
+        axes.set_yscale("log")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _consistency_figure(state: Refinement) -> Figure:
     figure = Figure(figsize=(10, 4.6), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
-    found = [("before", state.before), ("after", state.after)]
-    spreads = [one.spread_m[np.isfinite(one.spread_m)] for _, one in found if one is not None]
-    top_cm = max(100 * float(np.percentile(np.concatenate(spreads), 95)), 0.1) if len(np.concatenate(spreads)) else 1.0
-    image = None
-    for axis, (name, consistency) in zip(axes, found, strict=True):
-        if consistency is None:
-            continue
-        extent = _extent(consistency)
+    maps = [(name, one) for name, one in (("before", state.before), ("after", state.after)) if one is not None]
+    spreads_m = np.concatenate([one.spread_m[np.isfinite(one.spread_m)] for _, one in maps])
+    top_cm = max(100 * float(np.percentile(spreads_m, 95)), 0.1) if len(spreads_m) else 1.0
+    for axis, (name, consistency) in zip(axes, maps, strict=False):
+        lower = np.asarray(consistency.grid.origin_m, np.float64)
+        upper = lower + np.asarray(consistency.grid.voxel_size_m, np.float64) * consistency.grid.shape
         image = axis.imshow(
-            100 * consistency.spread_m.T, origin="lower", extent=extent, vmin=0, vmax=top_cm, cmap="magma_r"
+            100 * consistency.spread_m.T,
+            origin="lower",
+            extent=(lower[0], upper[0], lower[1], upper[1]),
+            vmin=0,
+            vmax=top_cm,
+            cmap="magma_r",
         )
-        axis.set_title(f"{name}: {100 * consistency.height_m:.2f} cm")
-        axis.set_xlabel("east, m")
-    axes[0].set_ylabel("north, m")
-    if image is not None:
-        figure.colorbar(image, ax=axes, label="spread of heights between frames, cm", shrink=0.8)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary)
+        axis.set(title=f"{name}: {100 * consistency.height_m:.2f} cm", xlabel="east, m")
+        if axis is axes[0]:
+            axis.set_ylabel("north, m")
+            figure.colorbar(image, ax=axes, label="spread of heights between frames, cm", shrink=0.8)
+    return figure
 
 
-def _extent(consistency: Consistency) -> tuple[float, float, float, float]:
-    grid = consistency.grid
-    lower = np.asarray(grid.origin_m, np.float64)
-    upper = lower + np.asarray(grid.voxel_size_m, np.float64) * grid.shape
-    return float(lower[0]), float(upper[0]), float(lower[1]), float(upper[1])
-
-
-def _draw_trajectory(path: Path, state: Refinement) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+def _trajectory_figure(state: Refinement) -> Figure:
     figure = Figure(figsize=(10, 4.2), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
-    above, beside = figure.subplots(1, 2)
+    top_down, beside = figure.subplots(1, 2)
     before, after = state.given.T_world_camera[:, :3, 3], state.rig.T_world_camera[:, :3, 3]
-    way_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(after[:, :2], axis=0), axis=1)))
-    for name, place, colour in (("before", before, "#d55e00"), ("after", after, "#0072b2")):
-        above.plot(place[:, 0], place[:, 1], "o-", color=colour, label=name, markersize=3, linewidth=1)
-        beside.plot(way_m, place[:, 2], "o-", color=colour, label=name, markersize=3, linewidth=1)
-    above.set(xlabel="east, m", ylabel="north, m", aspect="equal")
-    beside.set(xlabel="way, m", ylabel="height, m")
-    above.legend(frameon=False)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary)
+    path_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(after[:, :2], axis=0), axis=1)))
+    for name, place, colour in (("before", before, _BEFORE), ("after", after, _AFTER)):
+        top_down.plot(place[:, 0], place[:, 1], "o-", color=colour, label=name, markersize=3, linewidth=1)
+        beside.plot(path_m, place[:, 2], "o-", color=colour, label=name, markersize=3, linewidth=1)
+    top_down.set(xlabel="east, m", ylabel="north, m", aspect="equal", adjustable="datalim")
+    beside.set(xlabel="distance along the path, m", ylabel="height, m")
+    beside.legend(frameon=False)
+    return figure

@@ -28,8 +28,7 @@ from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, training_form
 from jaxmap.models.resizing import resize_bilinear
 from jaxmap.training.options import TrainingOptions
-from jaxmap.training.step import StepMetrics
-from jaxmap.training.step import TrainState, make_updater, parted
+from jaxmap.training.step import StepMetrics, TrainState, make_updater, parted
 from jaxmap.tuning.frame_crops import FrameBatch, crop_frame, points_per_pixel, widest_camera
 from jaxmap.tuning.map_loss import MapTruth, cells_loss, soft_cells
 from jaxmap.tuning.options import MapLossOptions

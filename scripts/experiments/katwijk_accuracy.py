@@ -26,7 +26,7 @@ from jaxmap.datasets.katwijk import CAMERAS, open_katwijk
 from jaxmap.datasets.katwijk_rover import R_BODY_IMU
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at, read_poses
-from jaxmap.evaluation.pose_scores import PoseErrors, pose_errors
+from jaxmap.evaluation.geometry_scores import PoseErrors, pose_errors
 from jaxmap.simulation.sensors import time_stamp
 
 T_IMU_CAMERA = CAMERAS["loccam"].T_mount_camera

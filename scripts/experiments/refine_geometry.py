@@ -25,12 +25,12 @@ from jaxmap.datasets import ReadOptions
 from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.bounds import usable_depth
+from jaxmap.refinement.frames import pinhole
+from jaxmap.refinement.refine import GroundReference, refine
 from jaxmap.refinement.rig import vehicle_axes
-from jaxmap.refinement.rounds import Ground, refine
-from jaxmap.refinement.solve import Prior
-from jaxmap.refinement.views import pinhole
+from jaxmap.refinement.solver import Prior
 from jaxmap.runs.config import DepthConfig, MapConfig
-from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, ground_of, read_inputs
+from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, read_ground, read_inputs
 
 POSITION_M, ANGLE_RAD = 0.2, np.radians(1.0)
 PITCH_RAD, HEIGHT_M = np.radians(2.0), 0.1
@@ -51,7 +51,7 @@ def disturbed(T: np.ndarray, seed: int) -> np.ndarray:
 def mounted_wrong(T: np.ndarray, seed: int) -> np.ndarray:
     """All cameras pitched by 2 degrees and 0.1 m too high or too low."""
     pitch, height = np.random.default_rng(seed).choice([-1, 1], 2)
-    R = vehicle_axes(T).R_vehicle_camera
+    R = vehicle_axes(T)
     D = np.eye(4)
     D[:3, :3] = R.T @ Rotation.from_rotvec([0, pitch * PITCH_RAD, 0]).as_matrix() @ R
     D[:3, 3] = R.T @ [0, 0, height * HEIGHT_M]
@@ -117,11 +117,11 @@ def main() -> None:
     inputs = read_inputs(given.sequence, ReadOptions(poses=given.true_poses, max_pose_gap_s=10.0, crs=given.crs))
     T_true, camera = inputs.T_world_camera, inputs.front_end.camera
     depth_m = usable_depth(camera, DEPTH_SIGMA_M, 0.5)
-    grounds = {"images alone": Ground()}
+    grounds = {"images alone": GroundReference()}
     if given.truth:
-        grounds["with labelled rocks"] = ground_of(GroundFiles(truth=(given.truth,)), inputs, depth_m)[0]
+        grounds["with labelled rocks"] = read_ground(GroundFiles(truth=(given.truth,)), inputs, depth_m)[0]
     if given.dem:
-        grounds["with elevation model"] = ground_of(GroundFiles(heights=given.dem), inputs, depth_m)[0]
+        grounds["with elevation model"] = read_ground(GroundFiles(heights=given.dem), inputs, depth_m)[0]
     columns = {"what was wrong": "<20", "poses": "<22"}
     for where in ("", "aligned "):
         columns |= {f"{where}cm": "12.2f", f"{where}max": "12.2f", f"{where}deg": "12.3f", f"{where}max.": "13.3f"}
@@ -132,7 +132,7 @@ def main() -> None:
         table.row(name, "as given", *errors(T, T_true), rock_iou(T, given, inputs), None, None, None)
         for kind, ground in grounds.items():
             started_s = time.perf_counter()
-            state = refine(inputs.views, T, pinhole(camera), prior, ground, (0.3, depth_m))
+            state = refine(inputs.frames, T, pinhole(camera), prior, ground, (0.3, depth_m))
             seconds, found = time.perf_counter() - started_s, state.rig.T_world_camera
             assert state.before is not None and state.after is not None
             spread = (100 * state.after.height_m, 100 * state.before.height_m)

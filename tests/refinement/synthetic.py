@@ -1,4 +1,4 @@
-"""Rovers with known poses, and what their cameras would match: no images, only numbers."""
+"""Rovers with known poses, and the matches their cameras would give: no images, only numbers."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxmap.refinement.pairs import MatchTable
+from jaxmap.refinement.frames import Pinhole
+from jaxmap.refinement.matching import MatchTable
+from jaxmap.refinement.residuals import linearise, make_device_rig
 from jaxmap.refinement.rig import Rig
-from jaxmap.refinement.solve import Term
-from jaxmap.refinement.terms import linearise, make_setting
-from jaxmap.refinement.views import Pinhole
+from jaxmap.refinement.solver import ResidualTerm
 
 CAMERA = Pinhole(fx_px=400.0, fy_px=410.0, cx_px=255.0, cy_px=190.0, baseline_m=0.12, doffs_px=0.5)
 WIDTH_PX, HEIGHT_PX = 512, 384
@@ -34,7 +34,7 @@ def ground_height(x, y):
     return 0.08 * np.sin(1.3 * x + 0.4) + 0.05 * np.cos(1.7 * y) + 0.03 * np.sin(3.1 * x - 2.3 * y)
 
 
-def seen_px(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+def uvd_px(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Column, row and disparity of world points in a camera, NaN where it does not see them."""
     x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
     ahead = np.where(z > 0.5, z, np.nan)
@@ -50,9 +50,9 @@ def ground_points(count: int, rng: np.random.Generator, length_m: float = 10.0) 
 
 
 def matches_of(T: np.ndarray, rng: np.random.Generator, noise_px: float = 0.0, count: int = 1500) -> MatchTable:
-    """What frames up to three apart see in common."""
+    """Points that frames up to three apart both see."""
     points = ground_points(count, rng)
-    seen = [seen_px(one, points) for one in T]
+    seen = [uvd_px(one, points) for one in T]
     frames, pairs, rows = [], [], []
     for source in range(1, len(T)):
         for target in range(max(0, source - 3), source):
@@ -66,11 +66,11 @@ def matches_of(T: np.ndarray, rng: np.random.Generator, noise_px: float = 0.0, c
     return MatchTable(np.array(frames), pixels + noise_px * rng.normal(size=pixels.shape), np.array(pairs))
 
 
-def match_term(matches: MatchTable, sigma_px: float = 0.25) -> Term:
+def match_term(matches: MatchTable, sigma_px: float = 0.25) -> ResidualTerm:
     def at(rig: Rig):
-        return linearise(make_setting(rig, CAMERA, np.zeros(3)), matches.frames, matches.seen_px)
+        return linearise(make_device_rig(rig, CAMERA, np.zeros(3)), matches.frames, matches.uvd_px)
 
-    return Term(at, matches.frames, np.full(3, sigma_px), sigma_px, matches.pairs, 30.0)
+    return ResidualTerm(at, matches.frames, np.full(3, sigma_px), sigma_px, matches.pairs, 30.0)
 
 
 class PoseErrors(NamedTuple):

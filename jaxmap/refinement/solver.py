@@ -1,9 +1,9 @@
-"""Robust least squares over the poses, the mounting and the calibration; and what the data say of each of them.
+"""Robust least squares over the poses, the mounting and the calibration, with the covariance of the solution.
 
-The posterior of a rig is that of its priors (how wrong the given poses, the mounting, ... may be) and its terms
-(matches, heights), linearised: a Gauss-Newton step to its mode, held back by Levenberg's and Marquardt's damping where
-the step does not help, and the inverse of the normal matrix as its covariance. What the terms say nothing of keeps its
-prior.
+The posterior of a rig combines its priors (how wrong the given poses, the mounting, ... may be) with the residual
+terms (matches, heights). Its mode is found by Gauss-Newton steps on the linearised residuals, with damping as of
+Levenberg and Marquardt where a step does not reduce the cost; the inverse of the normal matrix is its covariance.
+Unobservable parameters keep their prior.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from jaxtyping import Bool, Float64
 from scipy.linalg import cho_factor, cho_solve
 
 from jaxmap.errors import JaxmapError
+from jaxmap.refinement.residuals import Linearised
 from jaxmap.refinement.rig import PER_FRAME, SHARED, Rig, displacement, moved
-from jaxmap.refinement.terms import Linearised
 
 ROBUST = 2.5
-"""Residuals of more than so many sigma pull less and less (Cauchy's function)."""
+"""Scale of the robust loss (Cauchy's), in sigma: larger residuals count less and less."""
 
 MAX_STEPS = 12
 CONVERGED = 0.02
-"""Steps of less than this share of the posterior's sigma are the last."""
+"""The iteration ends with a step below this share of the posterior's sigma in every parameter."""
 
 _LEAST_POSITION_M, _LEAST_ANGLE_RAD = 1e-3, np.radians(0.01)
 _CHI2_MEDIAN = {1: 0.455, 3: 2.366}
 
 
-class Term(NamedTuple):
-    """Residuals of one kind.
+class ResidualTerm(NamedTuple):
+    """Residuals of one kind, and how they are weighted.
 
     Attributes:
-        linearise: gives them at a rig.
+        linearise: evaluates them at a rig.
         frames: (M, F), the frames of each.
-        sigma: (R,), their standard deviations beside what the disparity's error makes.
-        disparity_sigma_px: of the disparity that the points were made of.
-        groups: (M,), from 0; errors within a group are alike in part.
-        group_worth: so many independent residuals a group is worth at most.
-        adapts: the noise is told from the residuals; else it is what was assumed.
+        sigma: (R,), their standard deviations, apart from what the error of the disparity causes.
+        disparity_sigma_px: standard deviation of the points' disparity.
+        groups: (M,), from 0; errors within a group are correlated.
+        group_weight: a group counts as so many independent residuals, at most.
+        estimate_noise: the noise is estimated from the residuals; else it is as assumed.
     """
 
     linearise: Callable[[Rig], Linearised]
@@ -48,14 +48,14 @@ class Term(NamedTuple):
     sigma: np.ndarray
     disparity_sigma_px: float
     groups: np.ndarray
-    group_worth: float
-    adapts: bool = True
+    group_weight: float
+    estimate_noise: bool = True
 
 
 class Prior(NamedTuple):
-    """How wrong the given rig may be, as standard deviations; 0 holds a number fixed.
+    """How wrong the given rig may be, as standard deviations; 0 holds a parameter fixed.
 
-    `position_m` and `angle_rad` are of each frame and axis; None has them estimated from the data.
+    `position_m` and `angle_rad` are of each frame and axis; None: estimated from the data.
     """
 
     position_m: float | None = None
@@ -67,7 +67,7 @@ class Prior(NamedTuple):
 
 
 FIRST_POSITION_M, FIRST_ANGLE_RAD = 0.2, np.radians(1.0)
-"""Taken at first where the errors of the poses are estimated from the data."""
+"""Initial values where the errors of the poses are estimated from the data."""
 
 
 class Solution(NamedTuple):
@@ -75,10 +75,10 @@ class Solution(NamedTuple):
 
     Attributes:
         rig: the refined rig.
-        covariance: (n, n) of `displacement`, zero where a number is held fixed.
+        covariance: (n, n) of `displacement`, zero where a parameter is held fixed.
         prior_sigma: (n,), as given or estimated.
-        residuals_px: the median distance of matches (the first term's), before the first step and after each.
-        noise_scales: for each term, its residuals in units of what was assumed.
+        residuals_px: the median length of the match residuals (the first term), before the first step and after each.
+        noise_scales: for each term, the variance of its residuals over the assumed one.
     """
 
     rig: Rig
@@ -88,14 +88,14 @@ class Solution(NamedTuple):
     noise_scales: list[float]
 
 
-def solve(rig: Rig, given: Rig, terms: Sequence[Term], prior: Prior, steps: int = MAX_STEPS) -> Solution:
+def solve(rig: Rig, given: Rig, terms: Sequence[ResidualTerm], prior: Prior, steps: int = MAX_STEPS) -> Solution:
     """The most likely rig.
 
     Args:
-        rig: where to begin.
-        given: what the prior is about.
+        rig: the initial rig.
+        given: the mean of the prior.
         terms: the residuals, those of matches first.
-        prior: how far the rig may be from what was given.
+        prior: how wrong the given rig may be.
         steps: at most so many.
 
     Raises:
@@ -109,10 +109,10 @@ def solve(rig: Rig, given: Rig, terms: Sequence[Term], prior: Prior, steps: int 
     for _ in range(steps):
         scales = [_noise_scale(term, part) for term, part in zip(terms, parts, strict=True)]
         normal, gradient, data_cost = _normal_equations(terms, parts, scales, len(sigma))
-        away = displacement(rig, given)
-        sigma = _estimated_sigma(prior, sigma, free, normal, gradient, away)
-        before = data_cost + _prior_cost(away, sigma, free)
-        step, covariance = _step(normal, gradient, away, sigma, free, damping)
+        deviation = displacement(rig, given)
+        sigma = _estimated_sigma(prior, sigma, free, normal, gradient, deviation)
+        before = data_cost + _prior_cost(deviation, sigma, free)
+        step, covariance = _step(normal, gradient, deviation, sigma, free, damping)
         candidate = moved(rig, step)
         candidate_parts = [term.linearise(candidate) for term in terms]
         after = _cost(terms, candidate_parts, scales) + _prior_cost(displacement(candidate, given), sigma, free)
@@ -142,49 +142,49 @@ def _prior_sigma(prior: Prior, frames: int) -> np.ndarray:
     return np.concatenate([own, mounting, [prior.baseline_scale, prior.offset_px]])
 
 
-def _noise_scale(term: Term, part: Linearised) -> float:
-    """The variance of the residuals, in units of what was assumed, by their median."""
-    if not len(part.residual) or not term.adapts:
+def _noise_scale(term: ResidualTerm, part: Linearised) -> float:
+    """The variance of the residuals over the assumed one, from their median."""
+    if not len(part.residual) or not term.estimate_noise:
         return 1.0
     squares = _squares(term, part)
     return float(max(np.median(squares) / _CHI2_MEDIAN[part.residual.shape[1]], 0.05))
 
 
-def _whiten(term: Term, part: Linearised, *columns: np.ndarray) -> list[np.ndarray]:
-    """Columns (M, R, k) in units of the residuals' errors."""
+def _whiten(term: ResidualTerm, part: Linearised, *columns: np.ndarray) -> list[np.ndarray]:
+    """Columns (M, R, k) whitened by the residuals' covariance."""
     by = part.by_disparity * term.disparity_sigma_px
     covariance = by[:, :, None] * by[:, None, :] + np.diag(term.sigma**2)
     factor = np.linalg.cholesky(covariance)
     return [np.linalg.solve(factor, column) for column in columns]
 
 
-def _squares(term: Term, part: Linearised) -> np.ndarray:
+def _squares(term: ResidualTerm, part: Linearised) -> np.ndarray:
     """Squared Mahalanobis length of each residual."""
     (white,) = _whiten(term, part, part.residual[..., None])
     return (white[..., 0] ** 2).sum(axis=1)
 
 
-def _worth(term: Term) -> np.ndarray:
-    """How much each residual counts, so that a group counts no more than it is worth."""
+def _weight(term: ResidualTerm) -> np.ndarray:
+    """Weight of each residual, such that no group counts for more than its `group_weight`."""
     counts = np.bincount(term.groups) if len(term.groups) else np.zeros(0)
-    return np.minimum(1.0, term.group_worth / np.maximum(counts, 1))[term.groups]
+    return np.minimum(1.0, term.group_weight / np.maximum(counts, 1))[term.groups]
 
 
-def _cost(terms: Sequence[Term], parts: Sequence[Linearised], scales: Sequence[float]) -> float:
+def _cost(terms: Sequence[ResidualTerm], parts: Sequence[Linearised], scales: Sequence[float]) -> float:
     total = 0.0
     for term, part, scale in zip(terms, parts, scales, strict=True):
         limit = ROBUST**2 * part.residual.shape[1]
-        total += float((_worth(term) * limit * np.log1p(_squares(term, part) / scale / limit)).sum())
+        total += float((_weight(term) * limit * np.log1p(_squares(term, part) / scale / limit)).sum())
     return total / 2
 
 
-def _prior_cost(away: np.ndarray, sigma: np.ndarray, free: np.ndarray) -> float:
-    # With the logarithm, as the sigmas may be estimated.
-    return float((0.5 * (away[free] / sigma[free]) ** 2 + np.log(sigma[free])).sum())
+def _prior_cost(deviation: np.ndarray, sigma: np.ndarray, free: np.ndarray) -> float:
+    # With its normalisation, as the sigmas may be estimated.
+    return float((0.5 * (deviation[free] / sigma[free]) ** 2 + np.log(sigma[free])).sum())
 
 
 def _normal_equations(
-    terms: Sequence[Term], parts: Sequence[Linearised], scales: Sequence[float], size: int
+    terms: Sequence[ResidualTerm], parts: Sequence[Linearised], scales: Sequence[float], size: int
 ) -> tuple[Float64[np.ndarray, "n n"], Float64[np.ndarray, "n"], float]:
     """The normal matrix and the gradient of the data, and their cost."""
     normal, gradient = np.zeros((size, size)), np.zeros(size)
@@ -195,17 +195,17 @@ def _normal_equations(
         local = np.concatenate([part.by_frames.reshape(count, rows, -1), part.by_shared], axis=-1)
         white, slope = _whiten(term, part, part.residual[..., None], local)
         limit = ROBUST**2 * rows
-        weight = _worth(term) / scale / (1 + (white[..., 0] ** 2).sum(axis=1) / scale / limit)
+        weight = _weight(term) / scale / (1 + (white[..., 0] ** 2).sum(axis=1) / scale / limit)
         half = np.sqrt(weight)[:, None, None]
         white, slope = white * half, slope * half
         order = np.lexsort(term.frames.T)
         borders = np.flatnonzero(np.any(np.diff(term.frames[order], axis=0) != 0, axis=1)) + 1
-        for rows_of in np.split(order, borders):
-            numbers = (PER_FRAME * term.frames[rows_of[0], :, None] + np.arange(PER_FRAME)).ravel()
-            numbers = np.concatenate([numbers, np.arange(size - SHARED, size)])
-            stacked = slope[rows_of].reshape(-1, slope.shape[-1])
-            normal[np.ix_(numbers, numbers)] += stacked.T @ stacked
-            gradient[numbers] += stacked.T @ white[rows_of].reshape(-1)
+        for same_frames in np.split(order, borders):
+            indices = (PER_FRAME * term.frames[same_frames[0], :, None] + np.arange(PER_FRAME)).ravel()
+            indices = np.concatenate([indices, np.arange(size - SHARED, size)])
+            stacked = slope[same_frames].reshape(-1, slope.shape[-1])
+            normal[np.ix_(indices, indices)] += stacked.T @ stacked
+            gradient[indices] += stacked.T @ white[same_frames].reshape(-1)
     if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
         raise JaxmapError(
             "the refinement diverges: residuals are not finite", fix="check the poses and the calibration"
@@ -214,7 +214,7 @@ def _normal_equations(
 
 
 def _step(
-    normal: np.ndarray, gradient: np.ndarray, away: np.ndarray, sigma: np.ndarray, free: np.ndarray, damping: float
+    normal: np.ndarray, gradient: np.ndarray, deviation: np.ndarray, sigma: np.ndarray, free: np.ndarray, damping: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The step towards the posterior's mode, and the covariance (undamped only where the damping is 0)."""
     weight = 1 / sigma[free] ** 2
@@ -225,14 +225,14 @@ def _step(
     try:
         factor = cho_factor(matrix * scale[:, None] * scale)
     except np.linalg.LinAlgError as error:
-        # Beside priors that say next to nothing, it is lost in rounding what only they decide.
+        # Parameters that only a very wide prior determines are lost in rounding.
         raise JaxmapError(
             "the refinement cannot be solved: some of its priors are too wide",
             where="the standard deviations",
             fix="give smaller ones: --sigma-position-m, --sigma-angle-deg, --sigma-mounting-m ...",
         ) from error
-    step, covariance = np.zeros(len(away)), np.zeros((len(away), len(away)))
-    step[free] = -scale * cho_solve(factor, scale * (gradient[free] + weight * away[free]))
+    step, covariance = np.zeros(len(deviation)), np.zeros((len(deviation), len(deviation)))
+    step[free] = -scale * cho_solve(factor, scale * (gradient[free] + weight * deviation[free]))
     covariance[np.ix_(free, free)] = scale[:, None] * cho_solve(factor, np.eye(len(scale))) * scale
     return step, covariance
 
@@ -243,11 +243,11 @@ def _estimated_sigma(
     free: Bool[np.ndarray, "n"],
     normal: np.ndarray,
     gradient: np.ndarray,
-    away: np.ndarray,
+    deviation: np.ndarray,
 ) -> np.ndarray:
-    """The errors of the given poses where they are to be told from the data, by expectation maximisation.
+    """The standard deviations of the given poses, where they are estimated: by expectation maximisation.
 
-    The variance of a group of numbers is the mean of their squares in the posterior: of the mode, and around it.
+    The variance of a group of parameters is the mean of their squares under the posterior: of its mode and around it.
     """
     frames = (len(sigma) - SHARED) // PER_FRAME
     kinds = [
@@ -258,10 +258,10 @@ def _estimated_sigma(
         return sigma
     sigma = sigma.copy()
     for _ in range(15):
-        step, covariance = _step(normal, gradient, away, sigma, free, 0.0)
-        squares = (away + step) ** 2 + np.diag(covariance)
+        step, covariance = _step(normal, gradient, deviation, sigma, free, 0.0)
+        squares = (deviation + step) ** 2 + np.diag(covariance)
         for estimated, columns, least in kinds:
-            numbers = (PER_FRAME * np.arange(frames)[:, None] + columns).ravel()
+            indices = (PER_FRAME * np.arange(frames)[:, None] + columns).ravel()
             if estimated:
-                sigma[numbers] = max(np.sqrt(squares[numbers].mean()), least)
+                sigma[indices] = max(np.sqrt(squares[indices].mean()), least)
     return sigma
