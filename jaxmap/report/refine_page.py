@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxmap.host.files import atomic_path
 from jaxmap.refinement.refine import Refinement
-from jaxmap.report.page import inline_image, page
+from jaxmap.report.page import inline_image, page, svg_of
 from jaxmap.report.wording import number_text
 
 CONSISTENCY, TRAJECTORY = "consistency.png", "trajectory.png"
@@ -122,17 +120,6 @@ def _notes(content: dict[str, Any]) -> str:
     notes = [*content["notes"], *(f"skipped {one['frame']}: {one['reason']}" for one in content["skipped"])]
     items = "".join(f"<li>{escape(str(note))}</li>" for note in notes)
     return f"<section><h2>Notes</h2><ul>{items}</ul></section>" if items else ""
-
-
-def svg_of(figure: Figure, title: str) -> str:
-    """A figure as an `<svg>` to put into a page; its text stays text."""
-    text = io.StringIO()
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": title}):
-        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
-    svg = text.getvalue()
-    style = "display:block;margin:0 auto;max-width:100%;height:auto"
-    drawing = svg[svg.index("<svg ") + len("<svg ") :]
-    return f'<svg role="img" aria-label="{escape(title)}" style="{style}" {drawing}'
 
 
 def _residual_figure(state: Refinement) -> Figure:

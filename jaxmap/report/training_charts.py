@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
-from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from jaxmap.labels import class_colours
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from jaxmap.report.page import LINE, QUIET, THEME, svg_of
 
 WIDTH_PX, FONT_PX = 520, 12
 MAX_DOTS = 30
@@ -22,9 +18,6 @@ LEAST_CONTRAST = 3.0
 LIGHT_PANEL, DARK_PANEL = (255, 255, 255), (27, 30, 36)
 """Background of the page's panels, as in page.css."""
 
-INK, QUIET, LINE, ACCENT, BAR = "#1f242b", "#667080", "#e4e1d9", "#b23c2e", "#c9b48d"
-_VARIABLES = {INK: "--ink", QUIET: "--quiet", LINE: "--line", ACCENT: "--accent", BAR: "--bar"}
-"""The variables of page.css that hold these colours on a light page, and others on a dark one."""
 
 Rgb = tuple[int, ...]
 
@@ -111,30 +104,7 @@ def line_chart(
         plot.set_axisbelow(True)
         for side, spine in plot.spines.items():
             spine.set(visible=side == "bottom", color=LINE)
-    return svg_of(figure, title, {**_VARIABLES, **(variables or {})})
-
-
-def svg_of(figure: Figure, title: str, variables: Mapping[str, str]) -> str:
-    """A figure as an SVG element of a page.
-
-    Args:
-        figure: drawn in the colours of a light page, on no background.
-        title: for those who cannot see it.
-        variables: CSS variables by the colours that they take the place of, so that a dark page has its own.
-    """
-    from matplotlib import rc_context
-
-    figure.patch.set_visible(False)
-    for plot in figure.axes:
-        plot.patch.set_visible(False)
-    text, unsaid = io.StringIO(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    # The same figure gives the same text, and the parts of each have names of their own.
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": title}):
-        figure.savefig(text, format="svg", metadata=unsaid)
-    svg = text.getvalue()
-    for colour, variable in variables.items():
-        svg = svg.replace(colour, f"var({variable})")
-    return svg[svg.index("<svg ") :].replace("<svg ", f'<svg class="chart" role="img" aria-label="{escape(title)}" ', 1)
+    return svg_of(figure, title, {**THEME, **(variables or {})})
 
 
 def class_style(classes: Sequence[str]) -> str:

@@ -16,20 +16,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from jaxmap.labels import IGNORE, class_colours
-from jaxmap.report.page import page
+from jaxmap.report.page import ACCENT, BAR, INK, page
 from jaxmap.report.pictures import overlay_labels
-from jaxmap.report.training_charts import (
-    ACCENT,
-    BAR,
-    INK,
-    LIGHT_PANEL,
-    QUIET,
-    Line,
-    class_inks,
-    class_style,
-    hex_of,
-    line_chart,
-)
+from jaxmap.report.training_charts import LIGHT_PANEL, QUIET, Line, class_inks, class_style, hex_of, line_chart
 from jaxmap.report.wording import number_text, share_text, value_text
 from jaxmap.training.validation import ValidationExample
 

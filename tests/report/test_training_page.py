@@ -22,7 +22,8 @@ from jaxmap.evaluation.segmentation_scores import SegmentationScores
 from jaxmap.labels import IGNORE, class_colours
 from jaxmap.report import training_charts as charts
 from jaxmap.report import training_page as report
-from jaxmap.report.training_charts import ACCENT, Line, line_chart
+from jaxmap.report.page import ACCENT
+from jaxmap.report.training_charts import Line, line_chart
 from jaxmap.report.training_page import (
     MAX_EXAMPLES,
     MISSED,
