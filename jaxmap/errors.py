@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-
-_OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
-
 
 class JaxmapError(Exception):
-    """A fault in the input or the machine, told in one line.
+    """A fault in the input or the machine, in one line.
 
     Args:
         what: what is wrong, without a full stop.
@@ -39,18 +33,3 @@ class FrameError(JaxmapError):
     def at(self, where: object) -> FrameError:
         """This error; placed there, if it does not say where it is."""
         return self if self.where else FrameError(self.what, where=where, fix=self.fix)
-
-
-def with_options(text: str, renamed: Callable[[str], str]) -> str:
-    """A text whose options are called as `renamed` says."""
-    return _OPTION.sub(lambda found: renamed(found[0]), text)
-
-
-@contextmanager
-def options_as(renamed: Callable[[str], str]) -> Iterator[None]:
-    """Lets errors of the block name options as the command at hand calls them; `renamed` gives its name of each."""
-    try:
-        yield
-    except JaxmapError as error:
-        what, where, fix = (with_options(text, renamed) for text in (error.what, error.where, error.fix))
-        raise type(error)(what, where=where, fix=fix) from error

@@ -30,9 +30,9 @@ def _static() -> dict[str, bool]:
 
 
 def to_device(value: npt.ArrayLike, dtype: DTypeLike | None = None) -> Array:
-    """Numbers of the host as an array of JAX's.
+    """Copies numbers to the device.
 
-    `jnp.asarray` comes to the same, but compiles a program for each new shape; this compiles nothing. Not to be called
+    `jnp.asarray` does the same, but compiles a program for each new shape; this compiles nothing. Not to be called
     within a traced function.
     """
     return jax.device_put(np.asarray(value, dtype))
@@ -205,7 +205,7 @@ class Plane(NamedTuple):
 
 
 class PointLabels(NamedTuple):
-    """What a labeller says of the points of a frame.
+    """The labels of the points of a frame.
 
     Exactly one of `labels` (`IGNORE` where unknown) and `probabilities` is given. Points whose
     `keep` is false are not fused at all; ignored points still say that something is there.

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from jaxmap.commands.console import Console, parse
-from jaxmap.errors import JaxmapError, UsageError, options_as
+from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.host.output_folder import check_inputs_stay
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
@@ -79,10 +79,8 @@ def main(words: Sequence[str]) -> int:
     check_inputs_stay((out, picture), read)
     diameters_m: dict[str, float] = dict(zip(SIZE_CLASSES, arguments.rock_diameters_m, strict=True))
     coding = choose_coding(arguments.remap, arguments.palette)
-    # The system of a map is that of the poses it was made of.
-    with options_as(lambda option: "jaxmap map --crs" if option == "--crs" else option):
-        truth = TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m)
-        evaluation, layer = evaluate_run(arguments.run, arguments.ground_truth, truth, arguments.scoring)
+    truth = TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m)
+    evaluation, layer = evaluate_run(arguments.run, arguments.ground_truth, truth, arguments.scoring)
     scores = evaluation.scores
     write_evaluation(out, picture, evaluation, layer, arguments.backdrop)
     for note in scores["notes"]:

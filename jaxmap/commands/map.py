@@ -36,14 +36,14 @@ class MapArguments:
     config: str | None = None
     """YAML file, or the name of a bundled one (chiodini2020, katwijk); options given here go before it."""
     resume: bool = False
-    """Go on with an interrupted run."""
+    """Resume an interrupted run."""
     overwrite: bool = False
     """Replace a run that lies in the folder."""
     checkpoint_every_s: float = 30.0
     """How often the map is saved on the way."""
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
-    TensorBoard), and tell where the time of a step goes; docs/performance.md explains it."""
+    TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
 
 
@@ -63,7 +63,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.runs.mapping_plan import plan_run
 
     keep_compiled_programs(scopes=arguments.profile)
-    # What ends a job on a cluster or a service is told like Ctrl-C: the map is saved first.
+    # SIGTERM, which ends jobs of clusters and services, counts as Ctrl-C: the map is saved first.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     folder = RunFolder(arguments.out)

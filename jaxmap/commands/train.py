@@ -12,7 +12,6 @@ import tyro
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
-from jaxmap.runs.config import check_config, config_tree
 from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainConfig
 
 OUTPUTS = ("report.html", "model.safetensors", "history.csv", "metrics.json", "config.yaml", "checkpoints/")
@@ -48,8 +47,6 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(TrainArguments, "train", words, with_config=_with_config)
     config = arguments.settings
-    # `MapConfig` is not validated when it is made.
-    check_config(config_tree(config.mapping))
     if arguments.resume and arguments.overwrite:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
 

@@ -169,7 +169,7 @@ def _check_overlap(covered: Extent, place: Extent, path: Path) -> tuple[str, ...
     if not there.overlaps(place):
         unknown = {
             (False, True): "; the raster has no CRS, name it with --truth-crs",
-            (True, False): "; the map has no CRS, name it with --crs",
+            (True, False): "; the map has no CRS: name it with jaxmap map --crs",
         }.get((covered.crs is not None, place.crs is not None), "; check that both are of one site")
         raise JaxmapError(
             f"the raster does not lie over the map: it reaches from {there.text()}, the map from {place.text()} "

@@ -24,7 +24,7 @@ AnyArray = Array | np.ndarray
 
 
 class EnsembleLayers(NamedTuple):
-    """What an ensemble says of each column, seen from above; NaN where the map saw no surface.
+    """Two layers of the top-down map that an ensemble gives; NaN where the map saw no surface.
 
     `probability` is that of the class; `missed` the same where the map does not call the class, 0 where it does.
     """
@@ -94,7 +94,7 @@ def stored_layers(
     """The layers of a class among those of a map (`MapAttributes.layers`); None where it has none.
 
     Raises:
-        JaxmapError: they hold what is no probability.
+        JaxmapError: a layer holds values that are not probabilities.
     """
     names = layer_names(target) if target is not None else ()
     if not names or not all(name in layers for name in names):
@@ -102,7 +102,7 @@ def stored_layers(
     for name in names:
         known = layers[name][~np.isnan(layers[name])]
         if known.size and not (known.min() >= 0 and known.max() <= 1):
-            raise JaxmapError(f"{name} holds what is no probability", where=where, fix="make the map again")
+            raise JaxmapError(f"{name} holds values that are not probabilities", where=where, fix="make the map again")
     return EnsembleLayers(*(layers[name] for name in names))
 
 

@@ -131,7 +131,7 @@ def estimate_track(
     problem = TrackProblem(fixes, knot_of_fix, odometry, roll_pitch, geometry, noise or TrackNoise())
     state = initial_state(fixes, problem)
     for iteration in range(MAX_ITERATIONS):
-        # The first steps are not near enough to tell outliers from good fixes.
+        # The first steps are not near enough to separate outliers from good fixes.
         step = problem.linearise(state, robust=iteration > 1).step()
         state += step
         if iteration > 2 and np.abs(step[:, : HEADING + 1]).max() < 1e-5:

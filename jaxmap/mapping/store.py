@@ -116,7 +116,7 @@ class MapAttributes:
         T_world_source: turns the world of the poses' source into the map's z-up world.
         fusion: the parameters and the rule the map was fused with; JSON values only.
         progress: how far the run got; `{"complete": True}` once it has ended.
-        layers: what else is known of each column, seen from above, by name; NaN where nothing is.
+        layers: other layers of the top-down map, by name; NaN where nothing is known.
     """
 
     crs: str | None = None
@@ -168,7 +168,7 @@ def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[Vo
 
     Args:
         path: the folder.
-        members: read those of an ensemble, too, where the map has one: what a run goes on with.
+        members: read those of an ensemble, too, where the map has one, as a resumed run needs them.
 
     Raises:
         JaxmapError: there is no map, it was written by a newer version, its parts disagree, a chunk is
@@ -215,7 +215,7 @@ def _write_group(folder: Path, arrays: dict[str, StoredArray], stored: dict[str,
 
     group = zarr.create_group(folder, zarr_format=3)
     counts = {name: write_array(group, name, array) for name, array in arrays.items()}
-    # Chunks of the fill value are not stored, so a lost chunk would read as that: their number tells.
+    # Chunks of the fill value are not stored, so a lost chunk would read as that: their number is kept.
     stored["chunks_stored"] = counts.pop(LOG_ODDS)
     group.update_attributes(stored | ({"chunks_stored_of": counts} if counts else {}))
 

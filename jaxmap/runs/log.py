@@ -54,7 +54,7 @@ class RunLog:
     """What a run has done so far; it is saved with the map, so that a resumed run goes on counting.
 
     Attributes:
-        next_index: the frame to go on with.
+        next_index: the next frame.
         fused: how many frames were fused.
         skipped: the others, each with its reason.
         stages_ms: what each stage took for a frame.
@@ -104,7 +104,7 @@ class RunLog:
         """The log of `as_json`.
 
         Raises:
-            JaxmapError: it is none.
+            JaxmapError: it is damaged, or of another version.
         """
         try:
             return TypeAdapter(cls).validate_python(progress)

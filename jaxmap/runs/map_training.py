@@ -39,7 +39,7 @@ from jaxmap.training.losses import class_weights
 from jaxmap.training.validation import MAX_EXAMPLES, Validation, ValidationExample
 from jaxmap.tuning.frame_crops import FrameBatch
 from jaxmap.tuning.map_loss import MapTruth, make_map_truth
-from jaxmap.tuning.map_step import SHOWN, Site, make_map_trainer
+from jaxmap.tuning.map_step import SHOWN, MapSupervision, make_map_trainer
 from jaxmap.tuning.options import MapLossOptions
 from jaxmap.types import Frame
 
@@ -281,7 +281,7 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
     )
     notify(describe_network(network))
     order = ExampleOrder.of(len(train), config)
-    site = Site(
+    supervision = MapSupervision(
         camera=plan.front_end.camera,
         grid=plan.grid,
         depth_range_m=plan.depth_range_m,
@@ -292,7 +292,7 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
         anchor=config.map_truth.anchor,
         temperature=config.map_truth.temperature,
     )
-    trainer = make_map_trainer(network.architecture, config, site, steps=order.steps)
+    trainer = make_map_trainer(network.architecture, config, supervision, steps=order.steps)
     return TrainingPlan(config, data, network, path, order, trainer)
 
 

@@ -35,7 +35,7 @@ def run_plan(
 ) -> dict[str, Any]:
     """Maps the sequence and writes all outputs.
 
-    A run folder that holds an interrupted run of the same settings is gone on with: the map comes
+    An interrupted run of the same settings in the folder is resumed: the map comes
     out as if the run had not been interrupted, bit for bit.
 
     Args:
@@ -45,7 +45,7 @@ def run_plan(
         checkpoint_every_s: how often the map is saved on the way.
         notify: takes lines for the user.
         on_frame: called after each frame.
-        profile: record a trace of some steps into the folder, and tell where their time went.
+        profile: record a trace of some steps into the folder, and report where their time went.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -76,7 +76,7 @@ def run_plan(
                 program = fused.cost.program
                 log.temporary_bytes = fused.cost.temporary_bytes
                 log.compile_s += fused.cost.compile_s
-                # Compiling is told apart from mapping.
+                # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
             log.add(fused)
             if fused.info is not None:

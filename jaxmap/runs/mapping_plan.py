@@ -1,4 +1,4 @@
-"""A mapping run, decided in full before the first frame: what is read, its range, bounds and step."""
+"""A mapping run, planned in full before the first frame: sequence, range, bounds, labeller and step."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None
 
     Raises:
         JaxmapError: the file cannot be read, or holds no whole network.
-        UsageError: it is not the one that the settings tell.
+        UsageError: it is not the one that the settings name.
     """
     if config.labeller != "deeplab":
         if config.model is not None:
@@ -366,7 +366,7 @@ def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int
     if members and rule.target(classes) is None:
         known = f"its classes are {' '.join(classes)}" if classes else "it has no class at all"
         raise UsageError(
-            f"an ensemble tells where the map misses a priority class, and the map has none: {known}",
+            f"an ensemble estimates where the map misses a priority class, and the map has none: {known}",
             where="ensemble.members",
             fix="name a class with --fusion.priority-classes, or leave the ensemble out",
         )

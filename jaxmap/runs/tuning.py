@@ -50,7 +50,7 @@ def tuned_config(config: MapConfig, params: TunedParams) -> MapConfig:
         params: what came out.
 
     Raises:
-        UsageError: a parameter is none that the settings accept; the bijectors rule that out.
+        UsageError: the settings refuse a parameter; the bijectors rule that out.
     """
     fusion = {name: _rounded(value) for name, value in fusion_numbers(params.fusion).items()}
     config = replace(config, fusion=replace(config.fusion, **fusion))

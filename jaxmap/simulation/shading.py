@@ -81,7 +81,7 @@ class Shading:
         sun = self._towards_sun(lane[6], lane[7])
         light = self._sun_irradiance * (dr.maximum(dr.dot(hit.normal, sun), 0.0) * self._open(hit, sun))
         bounce = self._cosine_direction(hit.normal, lane[8], lane[9])
-        # The open sky's light is known; the bounce only tells what stands in its way, so open ground has no noise.
+        # The open sky's light is known; the bounce only finds what stands in its way, so open ground has no noise.
         light += self._open_sky(hit.normal) + math.pi * (self._incoming(hit, bounce) - self._sky(bounce))
         light = dr.maximum(light, 0.0)
         matt = hit.albedo / math.pi * light

@@ -144,7 +144,7 @@ def render_view(seed: int, options: TrainingOptions) -> tuple[np.ndarray, np.nda
 
 
 def _without_specks(hits: FirstHits, mesh: Mesh) -> np.ndarray:
-    """The classes, and `IGNORE` where a rock is too far away to be told from a pebble."""
+    """The classes, and `IGNORE` where a rock is too far away to be distinguished from a pebble."""
     labels = surface_labels(hits, mesh)
     is_rock = labels == ROCK
     rock = mesh.part[hits.face[is_rock]]

@@ -83,7 +83,7 @@ def write_calibration(path: Path, rig: StereoRig) -> None:
 
 
 def claim_folder(folder: Path, record: Mapping[str, Any]) -> None:
-    """Writes `scene.json`, or checks that the one there tells of the same data set, which can then be finished.
+    """Writes `scene.json`, or checks that the one there describes the same data set, which can then be finished.
 
     Raises:
         JaxmapError: the folder holds another data set, or cannot be written.

@@ -43,8 +43,8 @@ _LEAST_AREA = 0.5
 """Share of a cell that a step's map must have seen."""
 
 
-class Site(NamedTuple):
-    """What maps are made of and compared with.
+class MapSupervision(NamedTuple):
+    """How maps are made of crops and compared with ground truth.
 
     Attributes:
         camera: of the rectified frames.
@@ -53,10 +53,10 @@ class Site(NamedTuple):
         params: the increments of fusion and how a map is read.
         rule: see `params`.
         truths: the ground truth of each class that it shows, by the index of the class.
-        losses: what the loss of each of these classes is made of; their mean is made small.
+        losses: the loss terms of each of these classes; their mean is minimised.
         anchor: weight of the anchor loss beside it.
-        temperature: divides the logits before their softmax is fused. Evidence is linear in probabilities, so that of a
-            pixel that is surely wrong has next to no slope, unlike its cross-entropy; softened, it learns.
+        temperature: divides the logits before their softmax is fused. Evidence is linear in probabilities, so that a
+            confidently wrong pixel has next to no gradient, unlike its cross-entropy; softened, it learns.
     """
 
     camera: StereoCamera
@@ -70,8 +70,8 @@ class Site(NamedTuple):
     temperature: float = 3.0
 
 
-class Pulled(NamedTuple):
-    """The loss of a step, the share of cells that its map calls rightly, and the gradient of the weights that move."""
+class PulledBackGradient(NamedTuple):
+    """The loss of a step, the accuracy of its map over cells, and the gradient of the trainable weights."""
 
     loss: Float[Array, ""]
     accuracy: Float[Array, ""]
@@ -85,14 +85,14 @@ class MapTrainer(NamedTuple):
         init: `(weights) -> TrainState`.
         step: `(state, batch, key) -> (state, StepMetrics)`, compiled once; the state passed in is donated. The key is
             the run's.
-        loss: `(weights, batch, key) -> (loss, accuracy)`: what the step makes small, to be differentiated or looked at.
-        pull_back: `(weights, batch, key) -> Pulled`: the same with its gradient, as the step takes it.
+        loss: `(weights, batch, key) -> (loss, accuracy)`: what the step minimises.
+        pull_back: `(weights, batch, key) -> PulledBackGradient`: the same with its gradient, as the step takes it.
     """
 
     init: Callable[[Weights], TrainState]
     step: Callable[[TrainState, FrameBatch, PRNGKeyArray], tuple[TrainState, StepMetrics]]
     loss: Callable[[Weights, FrameBatch, PRNGKeyArray], tuple[Array, Array]]
-    pull_back: Callable[[Weights, FrameBatch, PRNGKeyArray], Pulled]
+    pull_back: Callable[[Weights, FrameBatch, PRNGKeyArray], PulledBackGradient]
 
 
 class _Labelled(NamedTuple):
@@ -103,37 +103,41 @@ class _Labelled(NamedTuple):
     held: Array
 
 
-def make_map_trainer(architecture: Architecture, options: TrainingOptions, site: Site, *, steps: int) -> MapTrainer:
+def make_map_trainer(
+    architecture: Architecture, options: TrainingOptions, supervision: MapSupervision, *, steps: int
+) -> MapTrainer:
     """Builds the functions of a training run by maps.
 
     Args:
         architecture: the network; its batch norms keep their statistics, and its classes are the map's.
         options: the recipe; its losses are of no account.
-        site: the maps and their losses.
+        supervision: the maps and their losses.
         steps: of the whole run, for the schedule.
     """
     network = training_form(architecture, ())
     updater = make_updater(options, steps)
-    widest = widest_camera(site.camera, options.augmentation)
+    widest = widest_camera(supervision.camera, options.augmentation)
     labeller = make_files_labeller(architecture.classes, soft=True)
-    mapper = make_mapper(widest, site.grid, labeller, site.rule, site.depth_range_m)
+    mapper = make_mapper(widest, supervision.grid, labeller, supervision.rule, supervision.depth_range_m)
     fill = tuple(255 * value for value in architecture.mean)
-    shown = np.array([index in site.truths for index in range(len(architecture.classes))])
+    shown = np.array([index in supervision.truths for index in range(len(architecture.classes))])
     # Labels are given: nothing in fusion is random.
     map_key = jax.random.key(0)
 
     def label(weights: Weights, example: FrameBatch, key: Array) -> _Labelled:
         own_key = jax.random.fold_in(jax.random.fold_in(key, example.draws[0]), example.draws[1])
         view_key, dropout_key = jax.random.split(own_key)
-        crop = jax.lax.optimization_barrier(crop_frame(view_key, example, site.camera, options.augmentation, fill))
+        crop = jax.lax.optimization_barrier(
+            crop_frame(view_key, example, supervision.camera, options.augmentation, fill)
+        )
         logits = network(weights, crop.image[None], dropout_key)[0][0]
         fine = logits
         if points_per_pixel(options.augmentation) > 1:
             fine = resize_bilinear(logits[None], *crop.disparity_px.shape, align_corners=False)[0]
         frame = Frame(
-            crop.disparity_px, crop.T_world_camera, class_probabilities=jax.nn.softmax(fine / site.temperature)
+            crop.disparity_px, crop.T_world_camera, class_probabilities=jax.nn.softmax(fine / supervision.temperature)
         )
-        return _Labelled(frame, MapperParams(crop.camera, site.params), anchor_loss(logits, crop.anchors, shown))
+        return _Labelled(frame, MapperParams(crop.camera, supervision.params), anchor_loss(logits, crop.anchors, shown))
 
     def map_of(weights: Weights, batch: FrameBatch, key: Array) -> tuple[VoxelMap, Array]:
         def add(voxel_map: VoxelMap, example: FrameBatch) -> tuple[VoxelMap, Array]:
@@ -145,16 +149,16 @@ def make_map_trainer(architecture: Architecture, options: TrainingOptions, site:
 
     def loss(weights: Weights, batch: FrameBatch, key: Array) -> tuple[Array, Array]:
         voxel_map, held = map_of(weights, batch, key)
-        value, accuracy = site_loss(voxel_map, site)
-        return value + site.anchor * held, accuracy
+        value, accuracy = supervised_loss(voxel_map, supervision)
+        return value + supervision.anchor * held, accuracy
 
-    def pull_back(weights: Weights, batch: FrameBatch, key: Array) -> Pulled:
+    def pull_back(weights: Weights, batch: FrameBatch, key: Array) -> PulledBackGradient:
         moved, fixed = parted(weights, options)
         with jax.named_scope("map"):
             voxel_map, held = map_of(weights, batch, key)
         with jax.named_scope("map_loss"):
             (value, accuracy), cotangent = jax.value_and_grad(
-                lambda log_odds: site_loss(replace(voxel_map, log_odds=log_odds), site), has_aux=True
+                lambda log_odds: supervised_loss(replace(voxel_map, log_odds=log_odds), supervision), has_aux=True
             )(voxel_map.log_odds)
 
         def pull(gradient: Weights, example: FrameBatch) -> tuple[Weights, None]:
@@ -163,12 +167,12 @@ def make_map_trainer(architecture: Architecture, options: TrainingOptions, site:
                 return frame_evidence(mapper, labelled.frame, labelled.params, map_key, 0), labelled.held
 
             _, back = jax.vjp(evidence, moved)
-            own = back((cotangent, jnp.asarray(site.anchor / len(batch.draws), cotangent.dtype)))[0]
+            own = back((cotangent, jnp.asarray(supervision.anchor / len(batch.draws), cotangent.dtype)))[0]
             return jax.tree.map(jnp.add, gradient, own), None
 
         with jax.named_scope("pull_back"):
             gradient, _ = jax.lax.scan(pull, jax.tree.map(jnp.zeros_like, moved), batch)
-        return Pulled(value + site.anchor * held, accuracy, gradient)
+        return PulledBackGradient(value + supervision.anchor * held, accuracy, gradient)
 
     def step(state: TrainState, batch: FrameBatch, key: PRNGKeyArray) -> tuple[TrainState, StepMetrics]:
         pulled = pull_back(state.weights, batch, key)
@@ -177,16 +181,16 @@ def make_map_trainer(architecture: Architecture, options: TrainingOptions, site:
     return MapTrainer(updater.init, jax.jit(step, donate_argnums=0), loss, pull_back)
 
 
-def site_loss(voxel_map: VoxelMap, site: Site) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def supervised_loss(voxel_map: VoxelMap, supervision: MapSupervision) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The loss of a map, and the share of its observed, labelled cells that are called rightly; means over classes."""
-    numbers = [_class_loss(voxel_map, site, target) for target in site.truths]
+    numbers = [_class_loss(voxel_map, supervision, target) for target in supervision.truths]
     loss, accuracy = (jnp.stack(values).mean() for values in zip(*numbers, strict=True))
     return loss, accuracy
 
 
-def _class_loss(voxel_map: VoxelMap, site: Site, target: int) -> tuple[Array, Array]:
-    truth, options = site.truths[target], site.losses[target]
-    columns = soft_columns_of_map(voxel_map, site.params, site.rule, target, options.softness)
+def _class_loss(voxel_map: VoxelMap, supervision: MapSupervision, target: int) -> tuple[Array, Array]:
+    truth, options = supervision.truths[target], supervision.losses[target]
+    columns = soft_columns_of_map(voxel_map, supervision.params, supervision.rule, target, options.softness)
     said = soft_cells(columns, truth.shares, jnp.zeros(()), options)
     # The few crops of a step see many cells in part only. What the map says of the seen part counts, and not what it
     # would say of the rest, which no label can change.

@@ -21,7 +21,7 @@ from jaxmap.mapping.step import Mapper, MapperParams
 from jaxmap.types import Frame, VoxelMap
 
 MapLoss = Callable[[VoxelMap, MapperParams], Float[Array, ""]]
-"""A number to be made small, from the map and the parameters that it is read with."""
+"""A loss, from the map and the parameters that it is read with."""
 
 
 class MapGradient(NamedTuple):
@@ -102,7 +102,7 @@ def map_gradient(
 
     Args:
         mapper: the step.
-        frames: gone through twice, in the same order: a list, or an iterable that prepares them again.
+        frames: iterated twice, in the same order: a list, or an iterable that prepares them again.
         params: where the gradient is taken.
         key: of the run.
         loss_of_map: `(voxel_map, params) -> loss`. What it reads the map with (priors, thresholds) has its part in
@@ -113,10 +113,10 @@ def map_gradient(
         The loss, its gradient, of the structure of `params`, and the map. Without frames, that of the empty map.
 
     Raises:
-        JaxmapError: frames that can be gone through only once.
+        JaxmapError: frames that can be iterated only once.
     """
     if isinstance(frames, Iterator):
-        raise JaxmapError("the frames can be gone through only once", where="map_gradient", fix="give a list")
+        raise JaxmapError("the frames can be iterated only once", where="map_gradient", fix="give a list")
     functions = make_pull_back(mapper, loss_of_map) if pull_back is None else pull_back
     voxel_map = mapper.init()
     for frame in frames:

@@ -26,7 +26,7 @@ from jaxmap.training.options import AugmentationOptions, OptimiserOptions, Train
 from jaxmap.training.step import parted
 from jaxmap.tuning.frame_crops import FrameBatch
 from jaxmap.tuning.map_loss import MapTruth
-from jaxmap.tuning.map_step import SHOWN, MapTrainer, Site, anchor_loss, make_map_trainer
+from jaxmap.tuning.map_step import SHOWN, MapSupervision, MapTrainer, anchor_loss, make_map_trainer
 from jaxmap.tuning.options import MapLossOptions
 from jaxmap.types import make_grid
 
@@ -52,7 +52,7 @@ def boxes_from_above() -> np.ndarray:
     return rock
 
 
-def make_site() -> Site:
+def make_supervision() -> MapSupervision:
     rock, shares = boxes_from_above(), column_shares(GRID, make_cells(GRID, 0.2))
     known = jnp.ones(rock.shape, bool)
     truths = {
@@ -61,7 +61,7 @@ def make_site() -> Site:
     }
     losses = {SAND: MapLossOptions(), ROCK: MapLossOptions(class_weight=4.0)}
     fusion = make_fusion_params(ROVER_CLASSES)
-    return Site(CAMERA, GRID, (0.3, 4.5), fusion, FusionRule(), truths, losses)
+    return MapSupervision(CAMERA, GRID, (0.3, 4.5), fusion, FusionRule(), truths, losses)
 
 
 def make_batch(indices: tuple[int, ...]) -> FrameBatch:
@@ -86,7 +86,7 @@ TINY_ROVER = replace(TINY, classes=ROVER_CLASSES)
 
 @pytest.fixture(scope="module")
 def trainer(network_is_tiny) -> MapTrainer:
-    return make_map_trainer(TINY_ROVER, OPTIONS, make_site(), steps=10)
+    return make_map_trainer(TINY_ROVER, OPTIONS, make_supervision(), steps=10)
 
 
 @pytest.fixture(scope="module")
