@@ -24,6 +24,7 @@ DISTRIBUTIONS = {
     "annotated_types": "annotated-types",
     "cv2": "opencv-python-headless",
     "PIL": "pillow",
+    "mpl_toolkits": "matplotlib",
     "orbax": "orbax-checkpoint",
     "skimage": "scikit-image",
     "yaml": "pyyaml",

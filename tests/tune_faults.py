@@ -107,7 +107,6 @@ TUNE_FAULTS: dict[str, tuple[int, Damage]] = {
     "tune: no labels at all": (2, no_labels),
     "tune: unknown class": (2, with_words("--class", "tree")),
     "tune: unknown parameter": (2, with_words("--frozen", "gravity")),
-    "tune: even kernel": (2, with_words("--kernel", "4")),
     "tune: nothing held out": (2, with_words("--held-out-share", "0")),
     "tune: rock weighs less than nothing": (2, with_words("--class-weight", "-1")),
     "tune: weight that is no number": (2, with_words("--iou-weight", "nan")),

@@ -15,6 +15,9 @@ from jaxmap.host.files import config_folder
 
 Config = TypeVar("Config")
 
+_MOST_NAMED = 6
+"""Faults that one message names."""
+
 Positive = Gt(0)
 NotNegative = Ge(0)
 Probability = Interval(gt=0, lt=1)
@@ -28,7 +31,7 @@ def options(section: str = "") -> Callable[[type[Config]], type[Config]]:
         section: where it stands in a configuration; errors name its fields below it. Empty at the top.
 
     Raises:
-        UsageError: on making one of unknown or illegal values; names them all.
+        UsageError: on making one of unknown keys or illegal values.
     """
 
     def decorate(kind: type[Config]) -> type[Config]:
@@ -92,7 +95,7 @@ class Settings(Generic[Config]):
         """Builds the settings from plain values, strictly.
 
         Raises:
-            UsageError: names every unknown key and every value out of range.
+            UsageError: names unknown keys and values out of range.
         """
         try:
             return self._adapter.validate_python(tree)
@@ -117,4 +120,5 @@ def _complaints(error: ValidationError, section: str = "") -> str:
         else:
             value = repr(fault["input"])
             clauses.setdefault(key, f"{key} is {value[:60]}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
-    return "; ".join(clauses.values())
+    named, more = list(clauses.values())[:_MOST_NAMED], len(clauses) - _MOST_NAMED
+    return "; ".join([*named, f"and {more} more"] if more > 0 else named)

@@ -65,7 +65,9 @@ def make_plane_labeller(classes: Sequence[str], options: PlaneOptions | None = N
             if options.softness_m == 0:
                 labels = jnp.where(off_m > numbers["threshold_m"], rock, sand)
                 return (jnp.where(plane.found, labels, IGNORE),)
-            off = jax.nn.sigmoid((off_m - numbers["threshold_m"]) / numbers["softness_m"])
+            # So narrow a passage is sharp, and may be divided by.
+            softness_m = jnp.maximum(numbers["softness_m"], 1e-5)
+            off = jax.nn.sigmoid((off_m - numbers["threshold_m"]) / softness_m)
             of_class = {sand: 1.0 - off, rock: off}
             shares = (of_class.get(index, jnp.zeros_like(off)) for index in range(len(classes)))
             return tuple(jnp.where(plane.found, share, 0.0) for share in shares)

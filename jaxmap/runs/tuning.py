@@ -141,8 +141,7 @@ def plan_tuning(
         raise UsageError(f"no parameter {', '.join(unknown)}", where="--frozen", fix=f"name some of {' '.join(names)}")
     before = start
     if sharp and start.labeller:
-        # Widths are divided by: one so narrow makes no difference to a sharp threshold.
-        before = start._replace(labeller=start.labeller | {"softness_m": jnp.asarray(1e-5)})
+        before = start._replace(labeller=start.labeller | {"softness_m": jnp.zeros(())})
     return TuningPlan(config, tuple(mappings), classes.index(target), before, start)
 
 

@@ -111,11 +111,8 @@ FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     ),
     "weights: truncated checkpoint": (1, lambda given: IMPORT_FAULTS["truncated checkpoint"][1](given.folder)),
     "weights: unknown name": (2, lambda given: IMPORT_FAULTS["unknown public weights"][1](given.folder)),
-    "train: mask of another size": (
-        1,
-        lambda given: trained(given, "mask of another size", "--classes", "sand", "rock"),
-    ),
-    "train: a config of map": (2, lambda given: trained(given, "a config of map")),
+    "train: one mask missing": (1, lambda given: trained(given, "one mask missing", "--classes", "sand", "rock")),
+    "train: unknown keys in the config": (2, lambda given: trained(given, "unknown keys in the config")),
     "tune: no ground truth": (1, lambda given: TUNE_FAULTS["tune: truth missing"][1](given.scene, given.folder)),
     "tune: out is there": (2, lambda given: TUNE_FAULTS["tune: out is there"][1](given.scene, given.folder)),
     "refine: one frame": (1, lambda given: ["refine", given.scene, "--out", given.folder / "run", "--stop", 1]),

@@ -159,7 +159,7 @@ def test_no_spread_makes_numbers_that_are_none(mapper, position_m, disparity_px,
 
 
 def test_a_scan_fuses_members_as_a_loop_does(mapper):
-    params = MapperParams(CAMERA, FUSION, (), draw_ensemble_params(KEY, FUSION, WIDE))
+    params = MapperParams(CAMERA, FUSION, ensemble=draw_ensemble_params(KEY, FUSION, WIDE))
     errors = draw_pose_errors(KEY, TIMES_S, WIDE)
     frames = [replace(one, pose_errors=jnp.asarray(error)) for one, error in zip(FRAMES, errors, strict=True)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames)

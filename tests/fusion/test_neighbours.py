@@ -73,8 +73,16 @@ def test_a_kernel_survives_being_stored():
 
 
 @pytest.mark.parametrize(
-    "kernel", [np.ones((3, 2, 2)), np.ones((2, 3, 3)), np.ones((3, 3, 5)), np.full((3, 3, 3), np.nan), [[1], [1, 2]]]
+    ("kernel", "says"),
+    [
+        *(
+            (np.ones(shape), "is not 3 finite squares of one odd size in fusion")
+            for shape in ((3, 2, 2), (2, 3, 3), (3, 3, 5))
+        ),
+        (np.full((3, 3, 3), np.nan), "input should be a finite number"),
+        ([[1], [1, 2]], "input should be a valid tuple"),
+    ],
 )
-def test_other_kernels_are_refused(kernel):
-    with pytest.raises(JaxmapError, match="class_kernel is not 3 finite squares of one odd size in fusion; give one"):
+def test_other_kernels_are_refused(kernel, says):
+    with pytest.raises(JaxmapError, match=f"class_kernel.* {says}"):
         make_fusion_params(CLASSES, class_kernel=kernel)

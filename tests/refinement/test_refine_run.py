@@ -252,7 +252,7 @@ def test_an_elevation_model_of_another_place_or_height_system_is_refused(inputs,
 def test_the_coding_of_an_orthomosaic_can_be_given(inputs, tmp_path):
     codes = np.array([0, 40, 200], np.uint8)[labels_from_above()]
     truth = write_truth(tmp_path / "truth.tif", codes)
-    with pytest.raises(JaxmapError, match=r"mean nothing.*--remap"):
+    with pytest.raises(JaxmapError, match=r"without a class.*--remap"):
         read_ground(GroundFiles((truth,)), inputs, 5.0)
     (tmp_path / "palette.yaml").write_text("0: unlabelled\n40: sand\n200: rock\n")
     for coding in (

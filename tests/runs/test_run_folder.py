@@ -100,7 +100,7 @@ def test_a_crs_that_is_given_goes_into_the_geotiff(cli, scene_folder, tmp_path):
         assert image.crs.to_epsg() == 32631
     outcome = cli(*map_words(scene_folder, tmp_path / "other", "--crs", "EPSG:nothing"))
     assert outcome.status == 2
-    assert "no coordinate reference system" in outcome.error
+    assert "not a coordinate reference system" in outcome.error
 
 
 def test_poses_that_changed_do_not_go_on_in_the_same_map(cli, scene_copy, tmp_path):

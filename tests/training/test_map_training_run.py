@@ -209,7 +209,7 @@ FAULTS = {
     "codes without a meaning": (
         1,
         dict(map_truth__remap=("1=sand", "3=rock")),
-        "jaxmap evaluate (options below map_truth): label values that mean nothing",
+        "jaxmap evaluate (options below map_truth): label values without a class",
     ),
     "a truth of another system": (
         1,
