@@ -51,9 +51,9 @@ CHECKED_MODULES = (
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 install_import_hook([f"jaxmap.{name}" for name in CHECKED_MODULES], CHECKER)
 
-settings.register_profile("local", deadline=None, max_examples=25)
-settings.register_profile("ci", deadline=None, max_examples=25, derandomize=True, database=None)
-settings.load_profile("ci" if os.environ.get("CI") else "local")
+for name, examples in {"quick": 8, "all": 25}.items():
+    settings.register_profile(name, deadline=None, max_examples=examples)
+    settings.register_profile(f"ci-{name}", deadline=None, max_examples=examples, derandomize=True, database=None)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -65,6 +65,7 @@ PEAKS = pytest.StashKey[dict[str, tuple[float, str]]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    settings.load_profile(("ci-" if os.environ.get("CI") else "") + ("all" if config.getoption("--all") else "quick"))
     config.stash[PEAK] = (0.0, "")
     config.stash[PEAKS] = {}
     if not is_worker(config):

@@ -108,7 +108,14 @@ PRINTED = {
 }
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[] if page == "README.md" else [pytest.mark.slow])
+        for page in PAGES
+        if blocks(page, "python")
+    ],
+)
 def test_python_blocks_run(page, workshop, capsys):
     grid = jaxmap.make_grid([0, 0, 0], [1, 1, 1], 0.5)
     Path("runs/motorcycle").mkdir(parents=True)

@@ -186,6 +186,7 @@ def test_no_arguments_show_the_commands_with_status_2(cli):
     assert "usage: jaxmap COMMAND" in outcome.out + outcome.err
 
 
+@pytest.mark.slow
 def test_a_faulty_frame_is_reported_and_skipped_unless_strict(cli, scene_copy, tmp_path):
     truncated(scene_copy, tmp_path)
     outcome = cli(*map_words(scene_copy, tmp_path / "run"))

@@ -47,6 +47,7 @@ def test_errors_of_poses_are_offsets_or_noise_at_the_ends_of_the_correlation():
     assert abs(np.corrcoef(white[0, :, 0], white[1, :, 0])[0, 1]) < 0.15
 
 
+@pytest.mark.slow
 @given(st.integers(0, 5), st.integers(1, 4), st.integers(0, 4))
 @settings(max_examples=6)
 def test_more_members_and_more_frames_leave_the_others_as_they_are(seed, members, frames):

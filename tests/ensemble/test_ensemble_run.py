@@ -18,6 +18,8 @@ from jaxmap.mapping.store import load_map
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping import run_plan
 
+pytestmark = pytest.mark.slow
+
 MEMBERS = 3
 ENSEMBLE = ("--ensemble.members", str(MEMBERS))
 

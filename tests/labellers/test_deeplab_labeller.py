@@ -66,7 +66,7 @@ def segmented(size_px: tuple[int, int] | None) -> np.ndarray:
     return Segmenter(small_model(), size_px).logits(image_of(0))
 
 
-@pytest.mark.parametrize("size_px", [None, (40, 50)], ids=str)
+@pytest.mark.parametrize("size_px", [pytest.param(None, marks=pytest.mark.slow), (40, 50)], ids=str)
 def test_labels_are_those_of_segment(size_px):
     logits = segmented(size_px)
     labels = labelled(labeller_of(soft=False, size_px=size_px), frame_of(image_of(0))).labels
@@ -252,6 +252,7 @@ def test_a_frame_without_its_image_is_refused(soft, image, says):
 LEAVES = ("temperature", "classifier.kernel", "backbone.stages.1.0.convs.1.bias", "aspp.project.kernel")
 
 
+@pytest.mark.slow
 def test_gradients_of_the_map_with_respect_to_the_network_equal_finite_differences(soft):
     mapper, params = soft
     with jax.enable_x64(True):

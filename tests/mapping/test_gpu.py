@@ -64,6 +64,7 @@ def test_a_gpu_makes_the_map_of_the_cpu(gpu, scene_folder, settings):
     assert_same_map(mapped(plan, gpu), mapped(plan, jax.devices("cpu")[0]))
 
 
+@pytest.mark.slow
 def test_the_comparison_tells_maps_apart(scene_folder):
     """Where there is no GPU: equal maps pass, and another one does not."""
     cpu = jax.devices("cpu")[0]

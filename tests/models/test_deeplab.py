@@ -76,8 +76,7 @@ def test_the_network_of_a_key_is_always_the_same():
     assert not np.array_equal(one["backbone.stem.kernel"], other["backbone.stem.kernel"])
 
 
-QUICK_STRIDES = [(torch_architecture, 8, "mobilenet_v2"), (torch_architecture, 8, "resnet50")]
-QUICK_STRIDES += [(tf_architecture, 16, "mobilenet_v2"), (tf_architecture, 16, "xception65")]
+QUICK_STRIDES = [(torch_architecture, 8, "mobilenet_v2"), (tf_architecture, 16, "mobilenet_v2")]
 ALL_STRIDES = [(*family, name) for family in ((torch_architecture, 8), (tf_architecture, 16)) for name in BACKBONES]
 
 

@@ -195,6 +195,7 @@ def test_unknown_networks_are_refused(tmp_path):
         import_weights(tmp_path / "a.safetensors")
 
 
+@pytest.mark.slow
 def test_tables_name_every_block_once():
     for backbone in ("mobilenet_v2", "resnet18", "resnet50", "resnet101"):
         architecture = torch_architecture(backbone, ("a",))

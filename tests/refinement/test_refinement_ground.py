@@ -42,6 +42,7 @@ def labels(shift_m=(0.0, 0.0), cell_m: float = 0.05) -> GroundRaster:
     return GroundRaster(on_rock(x - shift_m[0], y - shift_m[1]).astype(float), lower, cell_m)
 
 
+@pytest.mark.slow
 def test_labels_are_found_where_the_relief_is():
     relief = rock_relief(relief_points(np.random.default_rng(0)))
     placed = register_labels(relief, labels((0.15, -0.1)), (2.5, 0.0))
@@ -101,6 +102,7 @@ def test_the_spread_between_frames_is_that_of_their_offsets():
     assert alike.height_m < 0.01
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_spread_brings_frames_together():
     points = jnp.asarray(frames_of(np.random.default_rng(3), (0.0, 0.1), per_frame=2000), jnp.float32)
     grid = make_grid([0, 0, -1], [3, 3, 1], [0.25, 0.25, 2.0])

@@ -105,6 +105,7 @@ def test_frames_agree_again_and_the_whole_stays_where_the_given_poses_are_in_the
     np.testing.assert_allclose(mean, 0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_an_elevation_model_puts_it_all_in_its_place():
     rng = np.random.default_rng(4)
     given = make_rig(disturbed(T_TRUE, rng, 0.2, 1.0))
@@ -144,6 +145,7 @@ def test_matches_determine_the_pitch_of_a_mounting_and_an_elevation_model_its_he
     assert sigma_up[1] < 0.1 * MOUNTING.mounting_m
 
 
+@pytest.mark.slow
 def test_the_ground_under_the_rover_reveals_a_wrong_height_of_the_mounting():
     rng = np.random.default_rng(6)
     T_given = wrong_mounting(0.0, 0.1)
@@ -168,6 +170,7 @@ def test_baseline_and_disparity_offset_are_found():
     assert found.rig.offset_px == pytest.approx(0.3, abs=0.03)
 
 
+@pytest.mark.slow
 def test_the_errors_of_the_poses_are_estimated_from_the_data():
     rng = np.random.default_rng(8)
     T_long = track(16, 0.4)

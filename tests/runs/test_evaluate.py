@@ -136,7 +136,7 @@ def test_a_map_without_a_system_is_an_error_that_says_where_it_gets_one(cli, tmp
     rock = np.zeros((4, 4), bool)
     run = write_map(tmp_path / "run", rock, ~rock, crs=None)
     outcome = cli("evaluate", run, truth_file(tmp_path))
-    assert (outcome.status, "the map has no CRS, name it with jaxmap map --crs" in outcome.error) == (1, True)
+    assert (outcome.status, "the map has no CRS: name it with jaxmap map --crs" in outcome.error) == (1, True)
 
 
 def test_the_error_map_shows_each_verdict_in_its_place(run, tmp_path):

@@ -59,12 +59,14 @@ def test_the_map_has_the_classes_asked_for_and_evidence_of_each(mapped):
     assert np.asarray(voxel_map.log_odds[1:] > 0).any(axis=(1, 2, 3)).all()
 
 
+@pytest.mark.slow
 def test_the_configuration_of_a_run_repeats_it_bit_for_bit(cli, scene_folder, mapped, tmp_path):
     words = ("map", scene_folder, "--out", tmp_path / "again", "--config", mapped / "config.yaml")
     assert cli(*words).status == 0
     np.testing.assert_array_equal(log_odds(tmp_path / "again"), log_odds(mapped))
 
 
+@pytest.mark.slow
 def test_a_run_is_gone_on_with_by_its_own_model_only(cli, scene_folder, mapped, model, tmp_path):
     run = Path(shutil.copytree(mapped, tmp_path / "run"))
     other = Path(shutil.copy(model, tmp_path / "other.safetensors"))
@@ -81,6 +83,7 @@ def test_a_run_is_gone_on_with_by_its_own_model_only(cli, scene_folder, mapped, 
     assert cli(*deeplab_words(scene_folder, run, model, *settings)).status == 0
 
 
+@pytest.mark.slow
 def test_the_frames_of_a_run_are_labelled_as_segment_labels_their_images(scene_folder, model):
     plan = planned(scene_folder, labeller="deeplab", model=str(model), stop=1)
     assert plan.labeller.classes == NETWORK_CLASSES
@@ -93,6 +96,7 @@ def test_the_frames_of_a_run_are_labelled_as_segment_labels_their_images(scene_f
     np.testing.assert_allclose(chosen[fused], logits.max(axis=-1)[fused], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_coloured_frame_among_grey_ones_is_mapped(cli, scene_copy, model, tmp_path):
     for side in ("left", "right"):
         image = scene_copy / side / "f001.png"

@@ -73,6 +73,7 @@ def test_the_metrics_tell_the_run(finished_run):
     assert voxels["by_class"]["sand"] > 0 and voxels["by_class"]["rock"] > 0
 
 
+@pytest.mark.slow
 def test_the_config_of_a_run_maps_again_to_the_same(finished_run, scene_folder, cli, tmp_path):
     tree = yaml.safe_load((finished_run / "config.yaml").read_text())
     assert tree.pop("sequence") == str(scene_folder)
@@ -105,6 +106,7 @@ def test_the_ground_is_sand_and_the_boxes_are_rock(finished_run):
     assert surface.sum() > 0.95 * near(voxels).sum()
 
 
+@pytest.mark.slow
 def test_files_of_true_labels_label_the_map(cli, scene_folder, tmp_path):
     words = ["--labeller", "files", "--labels", scene_folder / "labels"]
     assert cli(*map_words(scene_folder, tmp_path / "run", *words)).status == 0
@@ -116,6 +118,7 @@ def test_files_of_true_labels_label_the_map(cli, scene_folder, tmp_path):
     assert (voxels.label[tops] == ROCK).mean() > 0.97
 
 
+@pytest.mark.slow
 def test_one_hot_probabilities_and_indices_give_one_map(scene_copy, tmp_path):
     soft = tmp_path / "soft"
     soft.mkdir()
@@ -135,6 +138,7 @@ def test_an_ignored_pixel_says_that_something_is_there_and_no_class(scene_copy, 
     assert not evidence[1:].any()
 
 
+@pytest.mark.slow
 def test_raw_and_rectified_labels_are_one_where_the_images_are_rectified(scene_folder, tmp_path):
     for kind in ("raw", "rectified"):
         ran(scene_folder, tmp_path / kind, labeller="files", labels=scene_folder / "labels", labels_are=kind, stop=2)
@@ -191,6 +195,7 @@ def test_no_grid_is_made_that_is_not_needed(scene_folder, monkeypatch):
     assert len(made) == 1 + 2
 
 
+@pytest.mark.slow
 def test_the_paper_preset_and_an_override(cli, scene_folder, tmp_path):
     words = ["--config", "chiodini2020", "--grid.voxel-size-m", "0.1", "--fusion.class-hit", "1.5"]
     assert cli(*map_words(scene_folder, tmp_path / "run", *words)).status == 0
@@ -206,6 +211,7 @@ def test_the_paper_preset_and_an_override(cli, scene_folder, tmp_path):
     np.testing.assert_allclose(evidence[1:] / 1.5, np.rint(evidence[1:] / 1.5), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_georeferenced_poses_come_out_absolute(finished_run, tmp_path):
     # Whole voxels away, so that the maps are equal cell by cell.
     offset_m = (458074.0, 5429380.0, 162.0)
@@ -229,6 +235,7 @@ def test_georeferenced_poses_come_out_absolute(finished_run, tmp_path):
     np.testing.assert_allclose(track.T[:, :3, 3], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_unreadable_frame_is_passed_over_and_counted(scene_copy, tmp_path):
     image = scene_copy / "left" / "f002.png"
     image.write_bytes(image.read_bytes()[:3000])

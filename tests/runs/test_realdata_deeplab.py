@@ -19,6 +19,8 @@ from jaxmap.fusion.query import voxel_labels
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.store import load_map
 
+pytestmark = pytest.mark.slow
+
 SOURCE = "deeplabv3_mnv2_voc_trainval_folded.safetensors"
 
 

@@ -19,6 +19,8 @@ from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
 from jaxmap.stereo.rectify import make_rectifier
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("mode", ["3way", "sgbm", "hh", "hh4"])
 def test_the_motorcycle_is_matched_as_well_as_promised(mode):

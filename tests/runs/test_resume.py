@@ -68,7 +68,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("index", [0, 4])
+@pytest.mark.parametrize("index", [pytest.param(0, marks=pytest.mark.slow), 4])
 def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, finished_run, tmp_path):
     run_until(scene_folder, tmp_path / "run", index)
     saved = load_map(tmp_path / "run" / "map.zarr")[1].progress["next_index"] if index else 0
@@ -79,6 +79,7 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, fini
     same_run(tmp_path / "run", finished_run)
 
 
+@pytest.mark.slow
 def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
     run_until(scene_folder, tmp_path / "run", 2)
     folder = RunFolder(tmp_path / "run")
@@ -96,6 +97,7 @@ def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
     same_run(tmp_path / "run", finished_run)
 
 
+@pytest.mark.slow
 def test_a_skipped_frame_is_counted_once_over_a_cut(cli, scene_copy, tmp_path):
     (scene_copy / "right" / "f001.png").unlink()
     run_until(scene_copy, tmp_path / "run", 3)
@@ -105,6 +107,7 @@ def test_a_skipped_frame_is_counted_once_over_a_cut(cli, scene_copy, tmp_path):
     assert [skipped["frame"] for skipped in sequence["skipped"]] == ["f001"]
 
 
+@pytest.mark.slow
 def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_path):
     # The frames are slowed down, so that the process dies in the middle of the run.
     program = (
@@ -149,6 +152,7 @@ def test_other_settings_are_refused_by_name(cli, scene_folder, tmp_path):
     assert contents(tmp_path / "run") == before
 
 
+@pytest.mark.slow
 def test_another_sequence_is_refused(cli, scene_folder, scene_copy, tmp_path):
     run_until(scene_folder, tmp_path / "run", 2)
     outcome = cli(*map_words(scene_copy, tmp_path / "run", "--resume"))
@@ -156,12 +160,14 @@ def test_another_sequence_is_refused(cli, scene_folder, scene_copy, tmp_path):
     assert "sequence" in outcome.error
 
 
+@pytest.mark.slow
 def test_how_often_to_save_is_no_setting_of_the_map(cli, scene_folder, tmp_path):
     run_until(scene_folder, tmp_path / "run", 2)
     outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--checkpoint-every-s", "5"))
     assert outcome.status == 0
 
 
+@pytest.mark.slow
 def test_frames_that_are_gone_since_are_noticed(cli, scene_copy, tmp_path):
     """The log counts frames by their index, so the frames must still be those of then."""
     rows = (scene_copy / "times.txt").read_text().splitlines()
@@ -172,6 +178,7 @@ def test_frames_that_are_gone_since_are_noticed(cli, scene_copy, tmp_path):
     assert outcome.status != 0, "f004 was never fused, and f000 is counted"
 
 
+@pytest.mark.slow
 def test_a_sequence_that_grew_does_not_go_on_in_too_small_a_map(cli, scene_folder, tmp_path):
     """Automatic bounds follow the poses, but the map that was saved keeps its own."""
     short = write_folder_sequence(tmp_path / "scene", 3)
@@ -198,6 +205,7 @@ def test_a_used_folder_is_left_alone(cli, scene_folder, tmp_path):
     assert contents(tmp_path / "run") == before
 
 
+@pytest.mark.slow
 def test_overwriting_removes_what_an_earlier_run_has_written(cli, scene_folder, tmp_path):
     run = tmp_path / "run"
     assert cli(*map_words(scene_folder, run)).status == 0
@@ -217,6 +225,7 @@ def test_overwriting_and_resuming_exclude_each_other(cli, scene_folder, tmp_path
     assert outcome.status == 2, "one of the two is not done"
 
 
+@pytest.mark.slow
 def test_a_complete_run_is_gone_on_with_to_the_same_end(cli, scene_folder, finished_run, tmp_path):
     run = tmp_path / "run"
     assert cli(*map_words(scene_folder, run)).status == 0
@@ -227,6 +236,7 @@ def test_a_complete_run_is_gone_on_with_to_the_same_end(cli, scene_folder, finis
     same_run(run, finished_run)
 
 
+@pytest.mark.slow
 def test_resuming_in_an_empty_folder_starts(cli, scene_folder, finished_run, tmp_path):
     (tmp_path / "run").mkdir()
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
@@ -244,6 +254,7 @@ def test_a_damaged_checkpoint_is_an_error_and_is_kept(cli, scene_folder, tmp_pat
     assert contents(tmp_path / "run") == before
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_last_checkpoint(cli, scene_folder, finished_run, tmp_path, monkeypatch):
     write, saves = map_store._write_group, []
 
@@ -265,6 +276,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(cli, scene_folder, finished_run,
     same_run(tmp_path / "run", finished_run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("writer", ["write_exports", "write_poses"])
 def test_a_full_disk_at_the_end_leaves_a_map_to_resume(writer, cli, scene_folder, finished_run, tmp_path, monkeypatch):
     import jaxmap.runs.mapping

@@ -56,6 +56,7 @@ def test_files_that_no_run_has_written_are_left_alone(cli, scene_folder, tmp_pat
     assert (run / "map.ply").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_overwriting_keeps_pictures_that_are_not_the_runs(cli, scene_folder, finished_run, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished_run, run)
@@ -85,6 +86,7 @@ def test_labels_that_nobody_would_read_are_refused(cli, scene_folder, tmp_path):
     assert "--labeller files" in outcome.error
 
 
+@pytest.mark.slow
 def test_a_resolved_configuration_can_be_fed_back(cli, scene_folder, finished_run, tmp_path):
     assert cli(*map_words(scene_folder, tmp_path / "run", "--config", finished_run / "config.yaml")).status == 0
     first, again = (yaml.safe_load((run / "config.yaml").read_text()) for run in (finished_run, tmp_path / "run"))
@@ -103,6 +105,7 @@ def test_a_crs_that_is_given_goes_into_the_geotiff(cli, scene_folder, tmp_path):
     assert "not a coordinate reference system" in outcome.error
 
 
+@pytest.mark.slow
 def test_poses_that_changed_do_not_go_on_in_the_same_map(cli, scene_copy, tmp_path):
     run = tmp_path / "run"
     assert cli(*map_words(scene_copy, run)).status == 0

@@ -99,6 +99,7 @@ KINDS = {
 NAMES = ("Ωmega æ", "岩石 01", "a.b.c", "[x]{y}*", "'; rm -rf", "%s %d", "e\u0301")
 
 
+@pytest.mark.slow
 def test_every_kind_and_name_of_image_is_labelled(cli, model, picture, tmp_path):
     folder, out = tmp_path / "[岩石] %s" / "images", tmp_path / "[岩石] %s" / "out"
     folder.mkdir(parents=True)
@@ -154,6 +155,7 @@ def test_a_broken_photograph_does_not_keep_its_neighbours_from_being_labelled(cl
     assert contents(tmp_path).items() > before.items() and contents(tmp_path).keys() - before.keys() == new
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_whole_files(cli, model, picture, tmp_path, monkeypatch):
     for name in "ab":
         picture.save(tmp_path / f"{name}.jpg")

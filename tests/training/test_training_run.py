@@ -187,6 +187,7 @@ def test_the_scores_are_those_of_the_model_that_was_kept(cli, whole_run, tiny_da
     assert scores["confusion"] == best["confusion"]
 
 
+@pytest.mark.slow
 def test_no_time_is_counted_twice(plan, tmp_path):
     started_s = time.perf_counter()
     go(plan, tmp_path / "run")
@@ -245,6 +246,7 @@ def test_a_killed_process_is_resumed(plan, tiny_data, whole_run, tmp_path):
     assert all(path.name.isdecimal() for path in (run / "checkpoints").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_interrupt_is_one_line_and_says_how_to_resume(
     number, cli, plan, tiny_data, whole_run, tmp_path, monkeypatch
@@ -382,6 +384,7 @@ def test_no_validation_at_all(plan, data_copy, tmp_path):
     assert metrics_of(tmp_path / "run")["kept_epoch"] is None
 
 
+@pytest.mark.slow
 def test_fewer_examples_than_a_batch_holds(plan, data_copy, tmp_path):
     """Several epochs end in one step; each has its row, and the run is complete."""
     write_pair(data_copy, "only", *scene((40, 44), 0))
@@ -534,6 +537,7 @@ def small_disk(tmp_path):
     disk.unmount()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [pytest.param(0.2, marks=pytest.mark.slow), 0.5])
 def test_a_full_disk_is_one_line_and_the_run_is_resumed_after_it(share, plan, whole_run, small_disk):
     needed = sum(path.stat().st_blocks for path in whole_run.rglob("*")) // 2

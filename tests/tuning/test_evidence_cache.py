@@ -84,16 +84,13 @@ def numbers_of(recipe: CacheRecipe) -> dict[str, jax.Array]:
     return tunable_numbers(recipe.labeller, recipe.rule)
 
 
-CASES = [(name, rule) for name in LABELLERS for rule in RULES]
+LONG = ("plane", "network")
+"""Their programs take long to compile."""
+NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in LABELLERS]
 
 
-@pytest.mark.parametrize(
-    ("name", "rule"),
-    [
-        pytest.param(name, rule, marks=[pytest.mark.slow] if name in ("plane", "network") and rule != "own" else [])
-        for name, rule in CASES
-    ],
-)
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("rule", RULES)
 def test_it_fuses_what_the_mapper_fuses(name, rule):
     labeller, rule = LABELLERS[name], RULES[rule]
     recipe, frames = recipe_of(labeller, rule), frames_of(labeller)
@@ -115,7 +112,7 @@ def test_it_fuses_what_the_mapper_fuses(name, rule):
     assert not np.asarray(ours.log_odds)[:, ~hit].any()
 
 
-@pytest.mark.parametrize("name", LABELLERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_keeping_blocks_of_points_as_one_hardly_changes_the_evidence(name):
     labeller = LABELLERS[name]
     recipe = recipe_of(labeller, FusionRule())
@@ -158,7 +155,7 @@ def cache_of(name: str) -> EvidenceCache:
     return build_cache(recipe_of(labeller, RULES["own"]), frames_of(labeller), params, KEY)
 
 
-@pytest.mark.parametrize("name", LABELLERS)
+@pytest.mark.parametrize("name", NAMES)
 @given(seed=st.integers(0, 2**16))
 @settings(max_examples=5, deadline=None)
 def test_gradients_equal_finite_differences(name, seed):
@@ -191,7 +188,7 @@ def test_gradients_equal_finite_differences(name, seed):
             )
 
 
-@pytest.mark.parametrize("name", LABELLERS)
+@pytest.mark.parametrize("name", NAMES)
 @given(scale=st.sampled_from([0.0, 1.0, 30.0, 1e3]), seed=st.integers(0, 2**16))
 @settings(max_examples=8, deadline=None)
 def test_no_step_however_long_makes_an_illegal_or_infinite_number(name, scale, seed):

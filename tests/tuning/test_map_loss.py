@@ -32,6 +32,11 @@ RULES = [FusionRule(column=column, priority_classes=first) for column in ("sum",
 IDS = [f"{rule.column}-{'-'.join(rule.priority_classes)}" for rule in RULES]
 HARD = MapLossOptions(softness=Softness(1e-4, 1e-4, 1e-4))
 STEP = 1e-6
+SOME_RULES = [
+    pytest.param(rule, id=name, marks=[] if index in (0, 3) else [pytest.mark.slow])
+    for index, (rule, name) in enumerate(zip(RULES, IDS, strict=True))
+]
+"""One of each kind; the other two run with --all."""
 
 
 def raster(seed: int = 0) -> LabelRaster:
@@ -52,7 +57,7 @@ def a_map(seed: int, scale: float = 2.0):
     return replace(empty, log_odds=jnp.asarray(evidence, jnp.float32))
 
 
-@pytest.mark.parametrize("rule", RULES, ids=IDS)
+@pytest.mark.parametrize("rule", SOME_RULES)
 @pytest.mark.parametrize("seed", range(3))
 def test_it_goes_to_what_is_scored_as_decisions_harden(rule, seed):
     voxel_map = a_map(seed)
@@ -136,7 +141,7 @@ def loss_of(params: FusionParams, log_odds: jax.Array, truth: MapTruth, rule: Fu
 slopes = jax.jit(jax.grad(loss_of, argnums=(0, 1)), static_argnums=3)
 
 
-@pytest.mark.parametrize("rule", RULES, ids=IDS)
+@pytest.mark.parametrize("rule", SOME_RULES)
 @given(seed=st.integers(0, 2**16))
 @settings(max_examples=8, deadline=None)
 def test_gradients_equal_finite_differences(rule, seed):
@@ -161,7 +166,7 @@ def test_gradients_equal_finite_differences(rule, seed):
             np.testing.assert_allclose((ours * direction).sum(), slope, rtol=1e-4, atol=1e-7, err_msg=field.name)
 
 
-@pytest.mark.parametrize("rule", RULES, ids=IDS)
+@pytest.mark.parametrize("rule", SOME_RULES)
 @pytest.mark.parametrize("scale", [0.0, 1e-3, 1e5])
 def test_loss_and_gradients_are_finite_in_empty_and_saturated_maps(rule, scale):
     log_odds = a_map(3, scale).log_odds

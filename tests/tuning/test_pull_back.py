@@ -120,6 +120,7 @@ def test_the_order_of_the_frames_does_not_matter(frames, order):
     assert_close(gradient, other)
 
 
+@pytest.mark.slow
 def test_a_frame_labels_with_its_own_number():
     # The plane labeller draws with the number of the frame: what is pulled back must be what was fused.
     labeller = make_plane_labeller(ROVER_CLASSES, hypotheses=8, sample_points=64)
@@ -177,6 +178,7 @@ def test_all_frames_share_one_program():
     assert after[0] == after[1]
 
 
+@pytest.mark.slow
 def test_a_frame_takes_the_memory_of_its_window_however_large_the_map():
     taken, room = [], []
     for reach_m in (10.0, 40.0):

@@ -85,6 +85,7 @@ def test_it_writes_what_map_reads(cli, scene_folder, truth, tmp_path):
     assert cli("evaluate", run, truth).status == 0
 
 
+@pytest.mark.slow
 def test_what_was_best_is_on_disk_when_it_breaks(cli, scene_folder, truth, tmp_path, monkeypatch):
     real, out = jaxmap.runs.tuning.descend, tmp_path / "fusion.yaml"
 
@@ -104,6 +105,7 @@ def test_what_was_best_is_on_disk_when_it_breaks(cli, scene_folder, truth, tmp_p
     assert not out.with_suffix(".json").exists()
 
 
+@pytest.mark.slow
 def test_what_is_assumed_of_the_ground_truth_is_told(cli, scene_folder, truth, tmp_path):
     words = ("--steps", "1", "--held-out-share", "0.4", "--crs", "EPSG:32631")
     outcome = cli(*tune_words(scene_folder, truth, tmp_path / "fusion.yaml", *words))
@@ -126,6 +128,7 @@ def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder
     assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
 
 
+@pytest.mark.slow
 def test_a_descent_that_leads_nowhere_is_told(cli, scene_folder, truth, tmp_path):
     out = tmp_path / "fusion.yaml"
     words = ("--steps", "6", "--held-out-share", "0.4", "--learning-rate", "100")
@@ -185,6 +188,7 @@ def test_an_input_is_not_overwritten(option, suffix, cli, scene_folder, truth, t
     assert [path.name for path in tmp_path.iterdir()] == [mine.name] and mine.read_text() == "stride: 1"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".yaml", ".json", ".html"])
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     suffix, cli, scene_folder, truth, tmp_path, monkeypatch
@@ -202,6 +206,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     assert {path.suffix for path in tmp_path.iterdir()} == set(order), "no leftovers"
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_the_best_so_far_and_is_begun_anew(cli, scene_folder, truth, tmp_path):
     out = tmp_path / "fusion.yaml"
     words = tune_words(scene_folder, truth, out, *SHORT)
@@ -213,6 +218,7 @@ def test_a_killed_process_leaves_the_best_so_far_and_is_begun_anew(cli, scene_fo
     assert {path.name for path in tmp_path.iterdir()} == {"fusion.yaml", "fusion.json", "fusion.html"}
 
 
+@pytest.mark.slow
 def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, truth, tmp_path):
     out = tmp_path / "plane.yaml"
     words = ["tune", scene_folder, scene_folder, "--ground-truth", truth, truth, "--out", out, *SHORT]
