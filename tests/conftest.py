@@ -60,6 +60,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="run the tests marked slow, too")
 
 
+MOST_RESIDENT_MB = 900
+"""Compiled programs are dropped after a file that leaves more; a file adds up to 1 GB, and a worker stays below 2."""
+
 PEAK = pytest.StashKey[tuple[float, str]]()
 PEAKS = pytest.StashKey[dict[str, tuple[float, str]]]()
 
@@ -85,12 +88,20 @@ def _memory(request: pytest.FixtureRequest) -> Iterator[None]:
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
     if peak_mb > request.config.stash[PEAK][0]:
         request.config.stash[PEAK] = (peak_mb, request.node.nodeid)
-    if (jax := sys.modules.get("jax")) is not None:
+    if (jax := sys.modules.get("jax")) is not None and resident_mb() > MOST_RESIDENT_MB:
         jax.clear_caches()
         gc.collect()
         # The C library keeps what is freed in pieces, unless it is asked.
         with suppress(AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
+
+
+def resident_mb() -> float:
+    """The resident size of this process; infinite where the system does not say."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
+    except (OSError, ValueError, IndexError):
+        return float("inf")
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -37,6 +37,7 @@ def test_errors_of_poses_have_the_spread_and_the_correlation_that_were_asked_for
         np.testing.assert_allclose(found, np.full(6, expected), atol=0.12)
 
 
+@pytest.mark.slow
 def test_errors_of_poses_are_offsets_or_noise_at_the_ends_of_the_correlation():
     timestamps_s = np.arange(5.0)
     lasting = draw_pose_errors(KEY, timestamps_s, EnsembleOptions(members=2, pose_correlation_s=1e12))
@@ -120,6 +121,7 @@ def test_noise_of_disparities_is_shared_by_blocks(block_px):
     np.testing.assert_allclose(noise, reference_ensemble.noise_of_blocks(blocks, corner, shape, block_px), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_of_disparities_is_standard_normal_and_correlated_within_a_block():
     keys = jax.random.split(KEY, 3000)
     noise = np.asarray(jax.vmap(lambda key: disparity_noise(key, (6, 9), 4))(keys), np.float64)

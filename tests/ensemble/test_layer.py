@@ -142,7 +142,7 @@ def test_members_that_are_no_numbers_are_not_saved(tmp_path):
 @pytest.mark.parametrize("value", [-0.1, 1.5, np.inf])
 def test_layers_that_hold_no_probabilities_are_refused(value):
     layers = dict.fromkeys(layer_names("rock"), np.array([[np.nan, value]], np.float32))
-    with pytest.raises(JaxmapError, match="no probability"):
+    with pytest.raises(JaxmapError, match="not probabilities"):
         stored_layers(layers, "rock", "map.zarr")
 
 

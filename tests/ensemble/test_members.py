@@ -102,7 +102,8 @@ def test_the_same_key_gives_the_same_members_and_another_one_others(mapper):
     assert len({np.asarray(member).tobytes() for member in one.members}) == MEMBERS
 
 
-@pytest.mark.parametrize("soft", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("soft", [True, False])
 def test_members_computed_together_are_those_computed_one_by_one(soft):
     rule = FusionRule() if soft else FusionRule("once", column="max")
     mapper, frames = mapper_of(MEMBERS, soft=soft, rule=rule), FRAMES

@@ -76,7 +76,7 @@ def test_labels_are_those_of_segment(size_px):
     assert len(np.unique(labels)) > 1
 
 
-@pytest.mark.parametrize("size_px", [None, (40, 50)], ids=str)
+@pytest.mark.parametrize("size_px", [pytest.param(None, marks=pytest.mark.slow), (40, 50)], ids=str)
 def test_probabilities_are_those_of_segment_with_classes_merged_and_dropped(size_px):
     labeller = labeller_of(renamed=True, size_px=size_px, temperature=2.0)
     assert labeller.classes == ("rock",)

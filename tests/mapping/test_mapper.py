@@ -233,7 +233,9 @@ def test_a_pose_outside_the_grid_or_nowhere_changes_no_bit(mappers, translation_
     assert info.voxels_hit == info.voxels_freed == 0
 
 
-@pytest.mark.parametrize("classes", [(), pytest.param(tuple(f"class {n}" for n in range(21)), marks=pytest.mark.slow)], ids=len)
+@pytest.mark.parametrize(
+    "classes", [(), pytest.param(tuple(f"class {n}" for n in range(21)), marks=pytest.mark.slow)], ids=len
+)
 def test_any_number_of_classes_goes_through_the_step(classes):
     labeller = make_files_labeller(classes, soft=True) if classes else make_no_labeller()
     mapper = make_mapper(CAMERA, GRID, labeller, FusionRule(priority_classes=()), DEPTH_RANGE_M)

@@ -166,6 +166,7 @@ def test_the_results_state_what_was_found(refined):
     assert matched == "yes"
 
 
+@pytest.mark.slow
 def test_what_was_adjusted_of_the_calibration_is_written(run, inputs, tmp_path):
     run(tmp_path / "out", Prior(mounting_m=0.1, mounting_rad=0.1, baseline_scale=0.01, offset_px=0.5))
     path = tmp_path / "out" / "calibration.yaml"
@@ -281,6 +282,7 @@ def test_files_of_others_are_not_replaced(tmp_path):
         (tmp_path / name).unlink()
 
 
+@pytest.mark.slow
 def test_an_earlier_refinement_is_replaced_only_on_demand(run, tmp_path):
     out = tmp_path / "out"
     assert run(out)["frames"] == ["f000", "f001"]
@@ -349,6 +351,7 @@ def test_every_input_of_the_command_is_kept(option, name, cli, scene_folder, tmp
     assert contents(tmp_path) == {name: b"mine"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["refine.json", "poses.tum", "trajectory.png"])
 def test_a_full_disk_leaves_nothing_half_written(name, run, tmp_path, monkeypatch):
     out = tmp_path / "out"

@@ -128,6 +128,7 @@ def wrong_mounting(pitch_deg: float, up_m: float) -> np.ndarray:
 MOUNTING = Prior(position_m=0.005, angle_rad=np.radians(0.05), mounting_m=0.1, mounting_rad=np.radians(2))
 
 
+@pytest.mark.slow
 def test_matches_determine_the_pitch_of_a_mounting_and_an_elevation_model_its_height():
     rng = np.random.default_rng(5)
     given = make_rig(wrong_mounting(2.0, 0.1))

@@ -129,6 +129,7 @@ def test_one_hot_probabilities_and_indices_give_one_map(scene_copy, tmp_path):
     np.testing.assert_allclose(log_odds(tmp_path / "soft_run"), log_odds(tmp_path / "hard_run"), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_an_ignored_pixel_says_that_something_is_there_and_no_class(scene_copy, tmp_path):
     for file in (scene_copy / "labels").iterdir():
         Image.fromarray(np.full((120, 160), 255, np.uint8)).save(file)
@@ -251,6 +252,7 @@ def test_an_unreadable_frame_is_passed_over_and_counted(scene_copy, tmp_path):
     np.testing.assert_array_equal(log_odds(tmp_path / "run"), log_odds(tmp_path / "rest_run"))
 
 
+@pytest.mark.slow
 def test_the_first_frame_may_be_the_unreadable_one(scene_copy, tmp_path):
     (scene_copy / "left" / "f000.png").write_bytes(b"")
     metrics = ran(scene_copy, tmp_path / "run")
@@ -258,6 +260,7 @@ def test_the_first_frame_may_be_the_unreadable_one(scene_copy, tmp_path):
     assert all((tmp_path / "run" / name).exists() for name in OUTPUTS)
 
 
+@pytest.mark.slow
 def test_strict_stops_at_the_first_unusable_frame(scene_copy, tmp_path):
     (scene_copy / "right" / "f003.png").unlink()
     with pytest.raises(FrameError, match="right/f003.png"):
@@ -281,6 +284,7 @@ def test_no_usable_frame_at_all_is_an_error(scene_copy, tmp_path):
         ran(scene_copy, tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_a_missing_or_broken_label_costs_its_frame_alone(scene_copy, tmp_path):
     (scene_copy / "labels" / "f001.png").unlink()
     Image.fromarray(np.full((120, 160), 9, np.uint8)).save(scene_copy / "labels" / "f004.png")

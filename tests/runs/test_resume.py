@@ -219,6 +219,7 @@ def test_overwriting_removes_what_an_earlier_run_has_written(cli, scene_folder, 
     assert (run / "mine.txt").read_text() == "not the run's"
 
 
+@pytest.mark.slow
 def test_overwriting_and_resuming_exclude_each_other(cli, scene_folder, tmp_path):
     run_until(scene_folder, tmp_path / "run", 2)
     outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--overwrite"))

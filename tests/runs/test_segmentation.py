@@ -142,6 +142,7 @@ def test_one_pixel_is_enough_for_the_tensorflow_design():
     assert np.isfinite(segmenter.logits(seeded_image(1, 1))).all()
 
 
+@pytest.mark.slow
 def test_a_broken_photograph_does_not_keep_its_neighbours_from_being_labelled(cli, model, picture, tmp_path):
     """They may be labelled beside themselves."""
     for name in "abc":

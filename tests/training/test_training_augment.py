@@ -236,6 +236,7 @@ def test_a_pixel_of_an_image_without_labels_is_its_first():
     assert not rows.any() and not columns.any()
 
 
+@pytest.mark.slow
 def test_crops_around_classes_hold_what_is_rare():
     labels = jnp.zeros((64, 80), jnp.uint8).at[50, 7].set(2)
     size_px, enlarged = np.array(labels.shape), replace(OPTIONS, scale=(1.0, 2.0))

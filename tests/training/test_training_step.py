@@ -85,6 +85,7 @@ def frozen(network_is_tiny) -> Compiled:
     return Compiled(trainer, initial_weights(DROPPING, jax.random.key(2)))
 
 
+@pytest.mark.slow
 def test_two_images_are_learnt_by_heart(learning):
     state, infos = learning.run(50, batch_of())
     losses = [float(info.loss) for info in infos]

@@ -86,6 +86,7 @@ def numbers_of(recipe: CacheRecipe) -> dict[str, jax.Array]:
 
 LONG = ("plane", "network")
 """Their programs take long to compile."""
+SOFT_FIRST = [pytest.param(name, marks=[] if name == "soft" else [pytest.mark.slow]) for name in LABELLERS]
 NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in LABELLERS]
 
 
@@ -155,7 +156,9 @@ def cache_of(name: str) -> EvidenceCache:
     return build_cache(recipe_of(labeller, RULES["own"]), frames_of(labeller), params, KEY)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "soft" else [pytest.mark.slow]) for name in LABELLERS]
+)
 @given(seed=st.integers(0, 2**16))
 @settings(max_examples=5, deadline=None)
 def test_gradients_equal_finite_differences(name, seed):
@@ -188,7 +191,9 @@ def test_gradients_equal_finite_differences(name, seed):
             )
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "soft" else [pytest.mark.slow]) for name in LABELLERS]
+)
 @given(scale=st.sampled_from([0.0, 1.0, 30.0, 1e3]), seed=st.integers(0, 2**16))
 @settings(max_examples=8, deadline=None)
 def test_no_step_however_long_makes_an_illegal_or_infinite_number(name, scale, seed):

@@ -33,10 +33,10 @@ IDS = [f"{rule.column}-{'-'.join(rule.priority_classes)}" for rule in RULES]
 HARD = MapLossOptions(softness=Softness(1e-4, 1e-4, 1e-4))
 STEP = 1e-6
 SOME_RULES = [
-    pytest.param(rule, id=name, marks=[] if index in (0, 3) else [pytest.mark.slow])
+    pytest.param(rule, id=name, marks=[pytest.mark.slow] if index else [])
     for index, (rule, name) in enumerate(zip(RULES, IDS, strict=True))
 ]
-"""One of each kind; the other two run with --all."""
+"""The others run with --all."""
 
 
 def raster(seed: int = 0) -> LabelRaster:
