@@ -18,8 +18,7 @@ from scene import DEPTH_RANGE_M, DISPARITIES, VOXEL_M, Scene, grid_of, make_scen
 
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.host.files import config_folder
-from jaxmap.stereo.match import Matcher
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.stereo.rectify import StereoRig, make_rectifier, make_stereo_rig, rectify_image
 
 HYPOTHESES = {"small": 128, "medium": 512, "large": 2048}
@@ -190,7 +189,7 @@ def fuse(size: str) -> Case:
 def kept_points(scene: Scene) -> np.ndarray:
     """The points of a frame that are fused, (N, 3)."""
     points = ours.points_of(scene)
-    return np.asarray(points.points_world)[np.asarray(points.labels.keep)]
+    return np.asarray(points.cloud.points_world)[np.asarray(points.labels.keep)]
 
 
 def touched_once(scene: Scene, fused: ours.Prepared) -> Run:
@@ -199,7 +198,13 @@ def touched_once(scene: Scene, fused: ours.Prepared) -> Run:
         fused.run()
     log_odds, points = np.asarray(fused.result), ours.points_of(scene)
     touched = int((log_odds != 0).any(axis=0).sum())
-    read = [points.points_world, points.labels.labels, points.labels.keep, points.depth_m, points.valid]
+    read = [
+        points.cloud.points_world,
+        points.labels.labels,
+        points.labels.keep,
+        points.cloud.depth_m,
+        points.cloud.valid,
+    ]
     return peers.memory_pass([np.array(array) for array in read], touched * len(log_odds))
 
 

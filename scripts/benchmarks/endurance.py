@@ -120,7 +120,7 @@ def main() -> None:
         config = check_config({"labeller": "plane", "depth": {"max_m": 5.0}, "grid": {"voxel_size_m": 0.2}})
         plan = looped(plan_run(views, config, str), given.frames)
         watch, folder = Watch(plan, given.every), RunFolder(Path(name, "run"))
-        folder.begin(plan, config, resume=False, overwrite=False)
+        folder.begin(plan.settings(config), resume=False, overwrite=False)
         columns = ("frames", 8), ("frames/s", 14), ("resident, MiB", 15), ("most alive", 12), ("median wait, ms", 17)
         print("".join(f"{name:>{width}s}" for name, width in (*columns, (f"over {STALL_MS:.0f} ms", 15))))
         options: dict[str, Any] = {"strict": True, "checkpoint_every_s": 30.0, "notify": str}

@@ -26,13 +26,14 @@ from scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_poses
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import integrate
-from jaxmap.fusion.params import FusionRule, make_fusion_params
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import top_down
-from jaxmap.fusion.view import Reach, view_of
-from jaxmap.geometry.camera import disparity_to_points, transform_points
+from jaxmap.fusion.sensor_model import point_weights
+from jaxmap.geometry import camera as geometry
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.geometry.plane import fit_plane_mlesac
-from jaxmap.labellers.base import Labeller, make_no_labeller
+from jaxmap.labellers.base import Labeller, label_points, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller
@@ -43,16 +44,18 @@ from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import Weights, inference_network, initial_weights, training_form
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.options import StereoOptions
+from jaxmap.stereo.match import StereoOptions
 from jaxmap.training.losses import total_loss
-from jaxmap.training.optimiser import is_statistic
 from jaxmap.training.options import PixelLossOptions
+from jaxmap.training.step import is_statistic
 from jaxmap.tuning.pull_back import make_pull_back, map_gradient
 from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_grid, make_voxel_map
 
 NETWORK_PX = (384, 512)
 """Height and width that the network sees."""
 KEY = jax.random.key(0)
+SIGMA_PX = 0.5
+"""Standard deviation of disparity."""
 RULE = FusionRule()
 
 
@@ -94,18 +97,16 @@ def _compile(lowered: jax.stages.Lowered) -> tuple[jax.stages.Compiled, float, i
 class Points(NamedTuple):
     """The points of a frame as fusion takes them."""
 
-    points_world: jax.Array
+    cloud: geometry.PointCloud
     labels: PointLabels
-    depth_m: jax.Array
-    valid: jax.Array
 
 
 def project(scene: Scene) -> Prepared:
     """Disparity to points in the world."""
 
     def points(camera: Any, pose: jaxlie.SE3, disparity_px: jax.Array) -> tuple[jax.Array, jax.Array]:
-        points_camera, valid = disparity_to_points(camera, disparity_px)
-        return transform_points(pose, points_camera), valid
+        cloud = geometry.project(camera, pose, disparity_px, DEPTH_RANGE_M, SIGMA_PX)
+        return cloud.points_world, cloud.valid
 
     return prepare(points, scene.camera, scene.pose, jnp.asarray(scene.disparity_px))
 
@@ -113,12 +114,9 @@ def project(scene: Scene) -> Prepared:
 @cache
 def points_of(scene: Scene) -> Points:
     """The points of the scene's frame; those above 0.3 m are rock, the others sand."""
-    points_camera, valid = disparity_to_points(scene.camera, jnp.asarray(scene.disparity_px))
-    points_world = transform_points(scene.pose, points_camera).reshape(-1, 3)
-    depth_m = points_camera[..., 2]
-    keep = (valid & (depth_m >= DEPTH_RANGE_M[0]) & (depth_m <= DEPTH_RANGE_M[1])).reshape(-1)
-    classes = jnp.where(points_world[:, 2] > 0.3, ROVER_CLASSES.index("rock"), ROVER_CLASSES.index("sand"))
-    return Points(points_world, PointLabels(keep, labels=classes.astype(jnp.int32)), depth_m, valid)
+    cloud = geometry.project(scene.camera, scene.pose, jnp.asarray(scene.disparity_px), DEPTH_RANGE_M, SIGMA_PX)
+    classes = jnp.where(cloud.points_world[:, 2] > 0.3, ROVER_CLASSES.index("rock"), ROVER_CLASSES.index("sand"))
+    return Points(cloud, PointLabels(cloud.in_range.reshape(-1), labels=classes.astype(jnp.int32)))
 
 
 def fit_plane(points: np.ndarray, hypotheses: int) -> Prepared:
@@ -148,7 +146,7 @@ def carve_frame(scene: Scene, window: GridSpec) -> Prepared:
     def free(pose: jaxlie.SE3, depth_m: jax.Array, valid: jax.Array, window: GridSpec) -> jax.Array:
         return carve(scene.camera, pose, depth_m, valid, window, params, depth_range_m=DEPTH_RANGE_M)
 
-    return prepare(free, scene.pose, points.depth_m, points.valid, window)
+    return prepare(free, scene.pose, points.cloud.depth_m, points.cloud.valid, window)
 
 
 def integrate_frame(scene: Scene, grid: GridSpec) -> Prepared:
@@ -157,7 +155,7 @@ def integrate_frame(scene: Scene, grid: GridSpec) -> Prepared:
 
     def add(log_odds: jax.Array, rest: VoxelMap, points: Points, weights: jax.Array) -> jax.Array:
         voxel_map = replace(rest, log_odds=log_odds)
-        return integrate(voxel_map, points.points_world, points.labels, weights, params, RULE)[0].log_odds
+        return integrate(voxel_map, points.cloud.points_world, points.labels, weights, params, RULE)[0].log_odds
 
     rest = replace(empty, log_odds=None)
     return prepare_update(add, empty.log_odds, rest, points_of(scene), jnp.ones(scene.pixels))
@@ -167,12 +165,16 @@ def fuse_frame(scene: Scene, size: str) -> Prepared:
     """Carving and integration of one frame, as the step does them; the result is the map's tensor."""
     params, grid = make_fusion_params(ROVER_CLASSES), grid_of(size)
     empty = make_voxel_map(grid, ROVER_CLASSES)
-    reach = Reach(DEPTH_RANGE_M, window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1)))
+    shape = window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1))
 
     def fuse(log_odds: jax.Array, rest: VoxelMap, points: Points, pose: jaxlie.SE3) -> jax.Array:
-        view = view_of(grid, scene.camera, pose, points.depth_m, points.valid, params, RULE, reach)
-        voxel_map, where = replace(rest, log_odds=log_odds), {"window": view.window, "free": view.free}
-        return integrate(voxel_map, points.points_world, points.labels, view.weights, params, RULE, **where)[0].log_odds
+        cloud, voxel_map = points.cloud, replace(rest, log_odds=log_odds)
+        window = view_window(grid, scene.camera, pose, DEPTH_RANGE_M[1], shape)
+        free = carve(scene.camera, pose, cloud.depth_m, cloud.valid, grid, params, DEPTH_RANGE_M, window)
+        weights = point_weights(grid, cloud, RULE)
+        return integrate(voxel_map, cloud.points_world, points.labels, weights, params, RULE, window=window, free=free)[
+            0
+        ].log_odds
 
     return prepare_update(fuse, empty.log_odds, replace(empty, log_odds=None), points_of(scene), scene.pose)
 
@@ -235,10 +237,10 @@ def label_pixels(scene: Scene, size_px: tuple[int, int]) -> Prepared:
     """The network alone: class probabilities of all pixels of the scene's image, seen at `size_px` (height, width)."""
     labeller = make_deeplab_labeller(network_model(), size_px=size_px)
     frame = Frame(jnp.asarray(scene.disparity_px), scene.pose, image=jnp.asarray(scene.left))
-    nowhere, valid = jnp.zeros((scene.pixels, 3)), jnp.ones(scene.pixels, bool)
+    cloud = points_of(scene).cloud
 
     def probabilities(params: Any, frame: Frame) -> jax.Array | None:
-        return labeller.label(frame, nowhere, valid, params, KEY)[0].probabilities
+        return label_points(labeller, frame, cloud, params, KEY)[0].probabilities
 
     return prepare(probabilities, labeller.params, frame)
 

@@ -22,10 +22,12 @@ from jaxmap.evaluation.evaluate import ClassLayer, evaluate_map
 from jaxmap.evaluation.map_scores import Confusion, confusion_scores, count_confusion
 from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.evaluation.truth_cells import truth_cells
+from jaxmap.fusion.options import FusionOptions
+from jaxmap.geometry.options import DepthOptions, GridOptions
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.files import bundled
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
-from jaxmap.runs.config import DepthConfig, FusionConfig, GridConfig, MapConfig, load_config
+from jaxmap.runs.config import MapConfig, load_config
 from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.types import VoxelMap
@@ -41,11 +43,11 @@ rock cells moves by several hundredths when its lattice shifts by a part of a ce
 LABELS = {"true": "files", "deeplab": "deeplab", "plane": "plane"}
 """Sources of labels, and the labeller of each."""
 
-POINTS = FusionConfig(per_frame="sum", carve=False, range_weighting=False, class_hit=1.0, class_miss=-1.0)
+POINTS = FusionOptions(per_frame="sum", carve=False, range_weighting=False, class_hit=1.0, class_miss=-1.0)
 """The majority of points over all frames."""
 FRAMES = replace(POINTS, per_frame="mean", full_evidence_points=1.0)
 """Each frame has one vote, shared by its points."""
-FINE, COARSE = GridConfig(voxel_size_m=(0.05, 0.05, 0.2)), GridConfig(voxel_size_m=0.2)
+FINE, COARSE = GridOptions(voxel_size_m=(0.05, 0.05, 0.2)), GridOptions(voxel_size_m=0.2)
 
 
 def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:
@@ -78,7 +80,7 @@ class Traverse:
             labels_are="raw" if labels == "true" else "auto",
             model=model if labels == "deeplab" else None,
             poses=self.gt / "poses_utm.tum" if true_poses else None,
-            depth=DepthConfig(max_m=RANGE_M),
+            depth=DepthOptions(max_m=RANGE_M),
         )
 
 

@@ -22,8 +22,7 @@ from pyproj import Transformer
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from jaxmap.datasets.katwijk import CAMERAS, open_katwijk
-from jaxmap.datasets.katwijk_rover import R_BODY_IMU
+from jaxmap.datasets.katwijk import CAMERAS, R_BODY_IMU, open_katwijk
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at, read_poses
 from jaxmap.evaluation.geometry_scores import PoseErrors, pose_errors

@@ -17,7 +17,9 @@ import numpy as np
 from common import COARSE, FINE, FRAMES, POINTS, RANGE_M, Frames, Table, command_line, parse, rules
 
 from jaxmap.evaluation.map_scores import confusion_scores
-from jaxmap.runs.config import DepthConfig, FusionConfig, MapConfig
+from jaxmap.fusion.options import FusionOptions
+from jaxmap.geometry.options import DepthOptions
+from jaxmap.runs.config import MapConfig
 
 
 def rungs(base: MapConfig) -> Iterator[tuple[str, MapConfig]]:
@@ -28,7 +30,7 @@ def rungs(base: MapConfig) -> Iterator[tuple[str, MapConfig]]:
     yield "area: columns of 0.05 m, points", replace(base, grid=FINE, fusion=POINTS)
     yield "... a vote for each frame", replace(base, grid=FINE, fusion=FRAMES)
     yield "... in full from 8 points on", replace(base, grid=FINE, fusion=replace(FRAMES, full_evidence_points=8.0))
-    yield "... weighted by range noise", replace(base, grid=FINE, fusion=FusionConfig(carve=False))
+    yield "... weighted by range noise", replace(base, grid=FINE, fusion=FusionOptions(carve=False))
     yield "the default: free space carved, too", base
 
 
@@ -50,7 +52,7 @@ def main() -> None:
         labels_are=given.labels_are,
         poses=given.poses,
         crs=given.crs,
-        depth=DepthConfig(max_m=given.max_range_m),
+        depth=DepthOptions(max_m=given.max_range_m),
     )
     frames = Frames(given.sequence, given.truth)
     columns = {"rule": "<38", "IoU": "7.3f", "accuracy": "9.3f", "TP": "6d", "FP": "6d", "FN": "6d", "cells": "8d"}

@@ -19,8 +19,8 @@ from common import CELL_M, RANGE_M, Frames, Table, Traverse, command_line, jaxma
 from PIL import Image
 
 from jaxmap.datasets.images import as_rgb, read_index_image
+from jaxmap.labellers.options import DeeplabOptions
 from jaxmap.mapping.sequence import PreparedFrame
-from jaxmap.runs.config import DeeplabConfig
 from jaxmap.runs.mapping_plan import Plan
 
 SIZE_PX = (384, 512)
@@ -89,7 +89,7 @@ def main() -> None:
     given = parse(parser)
     traverse = Traverse(given.traverse)
     base = traverse.config("deeplab", true_poses=given.poses == "true")
-    base = replace(base, deeplab=DeeplabConfig(size_px=SIZE_PX))
+    base = replace(base, deeplab=DeeplabOptions(size_px=SIZE_PX))
     frames = Frames(traverse.sequence, traverse.truth)
     plan = frames.plan(base)
     learnt = len(frames.prepared) - round(len(frames.prepared) * given.held_out)

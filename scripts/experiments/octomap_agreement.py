@@ -27,7 +27,7 @@ from common import command_line, parse
 from jaxtyping import Bool, Float, Int, Int8
 
 from jaxmap.datasets.crs import Extent, transform_between
-from jaxmap.datasets.height_raster import read_heights
+from jaxmap.datasets.rasters import read_heights
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.query import observed, occupied
 from jaxmap.geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points

@@ -25,11 +25,12 @@ from jaxmap.datasets import ReadOptions
 from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.bounds import usable_depth
+from jaxmap.geometry.options import DepthOptions
 from jaxmap.refinement.frames import pinhole
 from jaxmap.refinement.refine import GroundReference, refine
 from jaxmap.refinement.rig import vehicle_axes
 from jaxmap.refinement.solver import Prior
-from jaxmap.runs.config import DepthConfig, MapConfig
+from jaxmap.runs.config import MapConfig
 from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, read_ground, read_inputs
 
 POSITION_M, ANGLE_RAD = 0.2, np.radians(1.0)
@@ -79,7 +80,7 @@ def errors(T: np.ndarray, T_true: np.ndarray) -> list[float]:
         turn = Rotation.from_matrix(T_true[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, :3]).magnitude()
         for values in (off_cm, np.degrees(turn)):
             numbers += [float(np.sqrt((values**2).mean())), float(values.max())]
-    left, R = np.linalg.inv(T_true) @ T, vehicle_axes(T_true).R_vehicle_camera
+    left, R = np.linalg.inv(T_true) @ T, vehicle_axes(T_true)
     pitch = (R @ np.degrees(Rotation.from_matrix(left[:, :3, :3]).as_rotvec()).mean(axis=0))[1]
     return [*numbers, float(pitch), float((R @ (100 * left[:, :3, 3].mean(axis=0)))[2])]
 
@@ -94,7 +95,7 @@ def rock_iou(T_rectified: np.ndarray, given: Namespace, inputs: RefineInputs) ->
         path = Path(folder) / "poses.tum"
         write_tum(path, np.array([frame.timestamp_s for frame in inputs.sequence.frames]), T)
         labels = {"labeller": "files", "labels": given.labels, "labels_are": given.labels_are}
-        depth = DepthConfig(max_m=RANGE_M)
+        depth = DepthOptions(max_m=RANGE_M)
         config = MapConfig(**labels, poses=path, crs=given.crs, depth=depth, max_pose_gap_s=10.0)
         return Frames(given.sequence, given.truth).scored(config).scores["iou"] or 0.0
 

@@ -18,7 +18,8 @@ from common import LABELS, Frames, Table, Traverse, command_line, parse
 
 from jaxmap.runs.config import MapConfig, load_config
 from jaxmap.runs.evaluation import TruthOptions
-from jaxmap.runs.tuning import Source, TuneOptions, TuningRun
+from jaxmap.runs.tuning import Source, TuningRun
+from jaxmap.tuning.options import TuneOptions
 
 SCORES = ("iou", "precision", "recall", "nll", "ece")
 
