@@ -6,15 +6,16 @@ from .ensemble.options import EnsembleOptions
 from .errors import FrameError, JaxmapError, UsageError
 from .fusion.carve import carve
 from .fusion.integrate import integrate
-from .fusion.options import FusionRule
+from .fusion.options import FusionOptions, FusionRule
 from .fusion.params import FusionParams, make_fusion_params
 from .fusion.query import TopDown, class_probabilities, occupancy_probability, top_down, voxel_labels
-from .geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
+from .geometry.camera import PointCloud, depth_sigma, disparity_to_points, points_to_pixels, project, transform_points
 from .geometry.grid import voxel_centres, world_to_voxel
 from .geometry.plane import fit_plane_mlesac, plane_distance
-from .labellers.base import Labeller, make_no_labeller
+from .labellers.base import Labeller, LabellerParams, make_no_labeller
 from .labellers.deeplab import make_deeplab_labeller
 from .labellers.files import make_files_labeller
+from .labellers.options import DeeplabOptions, PlaneOptions
 from .labellers.plane import make_plane_labeller
 from .labels import IGNORE, ROVER_CLASSES
 from .mapping.sequence import prepare_frames, run_sequence
@@ -47,19 +48,24 @@ __all__ = [
     "IGNORE",
     "ROVER_CLASSES",
     "Architecture",
+    "DeeplabOptions",
     "EnsembleLayers",
     "EnsembleOptions",
     "Frame",
     "FrameError",
+    "FusionOptions",
     "FusionParams",
     "FusionRule",
     "GridSpec",
     "JaxmapError",
     "Labeller",
+    "LabellerParams",
     "MapAttributes",
     "Mapper",
     "MapperParams",
     "Plane",
+    "PlaneOptions",
+    "PointCloud",
     "PointLabels",
     "PureNetwork",
     "ReadOptions",
@@ -103,6 +109,7 @@ __all__ = [
     "plane_distance",
     "points_to_pixels",
     "prepare_frames",
+    "project",
     "pure_form",
     "pure_network",
     "read_image",
