@@ -5,6 +5,7 @@ python scripts/make_settings_page.py
 
 from __future__ import annotations
 
+import argparse
 import ast
 import dataclasses
 import inspect
@@ -142,6 +143,7 @@ def page() -> str:
 
 def main() -> int:
     """Writes the page."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     PAGE.write_text(page(), encoding="utf-8")
     print(f"wrote {PAGE}")
     return 0

@@ -8,6 +8,7 @@ or two.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -109,9 +110,12 @@ def draw(run: RunContents) -> Figure:
 
 def main() -> int:
     """Maps the traverse unless a run is given, and draws it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", nargs="?", type=Path)
+    run = parser.parse_args().run
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(name) / "run"
-        if len(sys.argv) == 1:
+        folder = run or Path(name) / "run"
+        if run is None:
             jaxmap_main(["map", "sample:traverse", "--out", str(folder), *OPTIONS.split()])
         draw(read_run(folder)).savefig(Path(name) / "picture.png")
         Image.open(Path(name) / "picture.png").convert("RGB").quantize(256).save(PICTURE, optimize=True)

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 
 TESTS = {
@@ -17,6 +19,7 @@ TESTS = {
 }
 
 
+@pytest.mark.slow
 def test_a_test_that_dies_and_one_that_hangs_end_the_run_with_their_names(tmp_path):
     """Under the options of scripts/test and the settings of pyproject.toml, but for a shorter patience."""
     (options,) = re.findall(r'-m pytest (.*) "\$@"', (ROOT / "scripts" / "test").read_text())

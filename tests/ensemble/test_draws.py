@@ -22,6 +22,7 @@ KEY = jax.random.key(3)
 FUSION = make_fusion_params(CLASSES)
 
 
+@pytest.mark.slow
 def test_errors_of_poses_have_the_spread_and_the_correlation_that_were_asked_for():
     options = EnsembleOptions(
         members=1500, position_sigma_m=0.1, tilt_sigma_rad=0.02, heading_sigma_rad=0.3, pose_correlation_s=2.0

@@ -77,6 +77,7 @@ def mapped(mapper: Mapper, options: EnsembleOptions, frames: list[Frame] = FRAME
 WIDE = EnsembleOptions(members=MEMBERS, position_sigma_m=0.3, heading_sigma_rad=0.2, disparity_sigma_px=0.5)
 
 
+@pytest.mark.slow
 def test_without_spread_every_member_is_the_map(mapper, plain):
     voxel_map = mapped(mapper, replace(NO_SPREAD, members=MEMBERS))
     own = np.asarray(voxel_map.log_odds)[[0, 1 + ROCK]]

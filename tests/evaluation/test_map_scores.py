@@ -211,6 +211,7 @@ def test_a_perfect_map_scores_1_at_any_fraction():
         assert scores.scores["accuracy"] == 1.0, fraction
 
 
+@pytest.mark.slow
 def test_registration_finds_a_known_motion_and_says_so():
     rng = np.random.default_rng(3)
     labels = np.ones((120, 120), np.uint8)

@@ -66,6 +66,7 @@ def segmented(size_px: tuple[int, int] | None) -> np.ndarray:
     return Segmenter(small_model(), size_px).logits(image_of(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size_px", [pytest.param(None, marks=pytest.mark.slow), (40, 50)], ids=str)
 def test_labels_are_those_of_segment(size_px):
     logits = segmented(size_px)

@@ -143,6 +143,7 @@ def test_the_view_from_above_passes_finite_gradients(column, scale):
         assert np.abs(gradient[0]).max() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("softness_m", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_no_gradient_is_nan_with_the_plane_labeller(softness_m):
     labeller = make_plane_labeller(CLASSES, hypotheses=32, sample_points=256, softness_m=softness_m)

@@ -141,6 +141,7 @@ def test_a_window_gives_the_map_of_the_whole_grid_bit_for_bit():
     assert_maps_equal(*maps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", pytest.param("own", marks=pytest.mark.slow)])
 def test_compiled_equals_eager(mappers, name):
     frame, mapper = an_example_frame(3), mappers[name]

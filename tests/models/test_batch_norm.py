@@ -83,6 +83,7 @@ def test_activations_are_the_library_s(activation):
     np.testing.assert_array_equal(activate(values, activation), plain_activate(values, activation))
 
 
+@pytest.mark.slow
 def test_gradients_of_several_batches_at_once_are_those_of_each():
     images, scale, bias = normal(2, 3, 4, 4, 5).astype(jnp.float32), jnp.ones(5), jnp.zeros(5)
 
@@ -127,6 +128,7 @@ def test_a_mean_far_from_zero_does_not_drown_the_variance():
     np.testing.assert_allclose(variance, values.var(), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_no_gradient_flows_through_the_statistics():
     images = normal(1, 2, 2, 3).astype(jnp.float32)
     gradient = jax.grad(lambda x: sum(part.sum() for part in normalise_by_batch(x, *jnp.ones((2, 3)), EPS, "none")[1:]))

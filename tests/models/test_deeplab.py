@@ -42,6 +42,7 @@ SMALL = replace(torch_architecture("mobilenet_v2", CLASSES), top_conv=False, hea
 slow = pytest.mark.slow
 
 
+@pytest.mark.slow
 def test_a_small_network_keeps_the_laws():
     """Size, padding, batch, folding, the same bits twice, one compilation."""
     # Of all backbones it compiles fastest.
@@ -154,7 +155,7 @@ def test_faults_of_an_architecture_are_reported_together():
 
 FAMILIES = {"torch": torch_architecture, "tf": tf_architecture, "torchvision": torchvision_architecture}
 NARROW = {"head_channels": 4, "low_level_channels": 3}
-STEPS = (1e-6, 1e-7)
+STEPS = (1e-5, 1e-6, 1e-7)
 """The larger rounds off less, the smaller crosses fewer corners of a ReLU."""
 
 
@@ -221,8 +222,9 @@ def test_the_gradient_of_a_loss_is_its_finite_difference_for_every_kind_of_weigh
             ]
             found = [float(one - other) / (2 * step) for (one, other), step in zip(moved, STEPS, strict=True)]
             nearest = min(found, key=lambda slope: abs(slope - slopes[place]))
-            np.testing.assert_allclose(nearest, slopes[place], rtol=1e-4, err_msg=kind)
-            assert abs(slopes[place]) > 1e-6, f"{kind} does nothing"
+            # A loss of about 1, rounded by a few units in the last place, over the step.
+            np.testing.assert_allclose(nearest, slopes[place], rtol=1e-4, atol=1e-9, err_msg=kind)
+            assert abs(slopes[place]) > 1e-7, f"{kind} does nothing"
 
 
 @cache

@@ -151,6 +151,7 @@ def test_tensorflow_networks(tmp_path):
     assert imported.architecture == voc and same(imported.weights, voc, "network")
 
 
+@pytest.mark.slow
 def test_names_agree_with_the_published_lists(realdata):
     folder = realdata / "weights" / "state_dict_names"
     if not folder.is_dir():

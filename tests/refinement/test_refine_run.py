@@ -298,6 +298,7 @@ def test_an_earlier_refinement_is_replaced_only_on_demand(run, tmp_path):
     assert contents(out).keys() == before.keys() - {"calibration.yaml"}
 
 
+@pytest.mark.slow
 def test_a_refinement_that_fails_leaves_the_earlier_one(run, tmp_path, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise JaxmapError("no two frames")

@@ -146,6 +146,7 @@ def test_raw_and_rectified_labels_are_one_where_the_images_are_rectified(scene_f
     np.testing.assert_array_equal(log_odds(tmp_path / "raw"), log_odds(tmp_path / "rectified"))
 
 
+@pytest.mark.slow
 def test_without_a_labeller_there_is_geometry_alone(cli, scene_folder, finished_run, tmp_path):
     assert cli(*map_words(scene_folder, tmp_path / "run", "--labeller", "none")).status == 0
     evidence = log_odds(tmp_path / "run")

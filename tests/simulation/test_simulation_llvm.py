@@ -69,6 +69,7 @@ def test_the_working_library_nearest_to_version_19_is_taken_and_remembered(libra
     assert llvm.working_llvm() == str(made["v19"]) and tries(made["v19"]) == 2
 
 
+@pytest.mark.slow
 def test_a_library_that_hangs_is_left_out_for_this_time(libraries, monkeypatch):
     made = libraries(v19=HANGS_ONCE, v18=WORKS)
     monkeypatch.setattr(llvm, "_TRIAL_S", 3.0)

@@ -170,6 +170,7 @@ def test_depth_poses_labels_and_orthomosaic_agree(traverse):
             assert (below == 1).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_the_same_seed_writes_the_same_files(traverse, tmp_path):
     from jaxmap.simulation.traverse import TraverseOptions, simulate_traverse
 
@@ -179,6 +180,7 @@ def test_the_same_seed_writes_the_same_files(traverse, tmp_path):
     assert [name for name in first if first[name] != second[name]] == []
 
 
+@pytest.mark.slow
 def test_an_interrupted_traverse_is_finished(traverse, tmp_path):
     import shutil
 
@@ -222,6 +224,7 @@ def test_numbers_out_of_range_are_named(cli, tmp_path, words, where):
     assert outcome.status == 2 and where in outcome.error and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_training_images_come_with_masks_and_lists(tmp_path, cli):
     words = ("simulate", "--training", 3, "--size", 48, 64, "--seed", 2, "--samples", 1)
     for folder in ("a", "b"):

@@ -218,6 +218,7 @@ def test_draws_reach_all_that_they_may():
     assert never.scale.min() < 0.5 and never.scale.max() > 2.4
 
 
+@pytest.mark.slow
 @given(sizes, seeds)
 def test_drawn_pixels_are_of_all_classes_of_the_image_evenly(size_px, seed):
     _, labels = example(size_px, seed)
@@ -254,6 +255,7 @@ def test_crops_around_classes_hold_what_is_rare():
     assert 0.4 < held(1.0) < 0.65, "one of two classes is chosen"
 
 
+@pytest.mark.slow
 def test_the_same_key_is_the_same_example_whatever_stands_beside_it():
     words = [(seed, *example(size_px, seed), size_px, False) for seed, size_px in enumerate(SIZES_PX)]
     for one in words:

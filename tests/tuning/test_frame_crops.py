@@ -113,6 +113,7 @@ def test_what_lies_outside_the_image_is_nothing():
     assert (np.asarray(crop.image)[outside] == [1, 2, 3]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("crop_px", [CROP_PX, (80, 40)])
 @given(seed=st.integers(0, 2**31 - 1))
 @settings(max_examples=20, deadline=None)
