@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -59,8 +60,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="run the tests marked slow, too")
 
 
-MOST_RESIDENT_MB = 1200
-"""Compiled programs are dropped after a test that leaves more."""
+MOST_RESIDENT_MB = 900
+"""Compiled programs are dropped after a file that leaves more; a file adds up to 1 GB, and a worker stays below 2."""
 
 PEAK = pytest.StashKey[tuple[float, str]]()
 PEAKS = pytest.StashKey[dict[str, tuple[float, str]]]()
@@ -80,12 +81,13 @@ def is_worker(config: pytest.Config) -> bool:
     return hasattr(config, "workerinput")
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_runtest_teardown(item: pytest.Item) -> None:
-    """Notes the peak, and drops compiled programs, hundreds of MB, once a process holds too much."""
+@pytest.fixture(scope="module", autouse=True)
+def _memory(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Gives back what the programs of a test file hold, hundreds of MB, and notes the peak."""
+    yield
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
-    if peak_mb > item.config.stash[PEAK][0]:
-        item.config.stash[PEAK] = (peak_mb, item.nodeid)
+    if peak_mb > request.config.stash[PEAK][0]:
+        request.config.stash[PEAK] = (peak_mb, request.node.nodeid)
     if (jax := sys.modules.get("jax")) is not None and resident_mb() > MOST_RESIDENT_MB:
         jax.clear_caches()
         gc.collect()
