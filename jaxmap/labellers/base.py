@@ -87,18 +87,19 @@ def label_points(
     """Labels the points of a frame; also returns the labeller's estimate of the whole frame."""
     features = labeller.features(frame, cloud, params, key)
     estimate = labeller.estimate(features.of_frame, params.numbers)
-    keep = kept_points(labeller, features, estimate)
-    labels = features.map(lambda values: labeller.label(values, estimate, params.numbers))
+    return labels_of(labeller, features, estimate, params.numbers), estimate
+
+
+def labels_of(labeller: Labeller, features: PointFeatures, estimate: PyTree, numbers: Numbers) -> PointLabels:
+    """The labels that the numbers make of a frame's features, and which of its points are fused."""
+    choose, keep = labeller.keep, features.keep
+    if choose is not None:
+        keep = keep & features.map(lambda values: choose(values, estimate))[0]
+    labels = features.map(lambda values: labeller.label(values, estimate, numbers))
     if labeller.soft:
         # They are never stored side by side: each scatter reads its own one.
-        return PointLabels(keep, probabilities=jnp.stack(labels, axis=-1)), estimate
-    return PointLabels(keep, labels=labels[0]), estimate
-
-
-def kept_points(labeller: Labeller, features: PointFeatures, estimate: PyTree) -> Bool[Array, "N"]:
-    """The points of a frame that are fused."""
-    choose = labeller.keep
-    return features.keep if choose is None else features.keep & features.map(lambda values: choose(values, estimate))[0]
+        return PointLabels(keep, probabilities=jnp.stack(labels, axis=-1))
+    return PointLabels(keep, labels=labels[0])
 
 
 def make_no_labeller() -> Labeller:

@@ -28,7 +28,7 @@ from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, range_weight
 from jaxmap.geometry.camera import depth_sigma, project
 from jaxmap.geometry.grid import flat_voxel_index, view_window, whole_window, window_shape
-from jaxmap.labellers.base import Labeller, Numbers, harden, kept_points, label_points
+from jaxmap.labellers.base import Labeller, Numbers, harden, labels_of
 from jaxmap.mapping.step import MapperParams
 from jaxmap.tuning.options import BLOCK_PX
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
@@ -137,11 +137,12 @@ def _observer(recipe: CacheRecipe) -> Any:
         cloud = project(params.camera, pose, frame.disparity_px, recipe.depth_range_m, fusion.disparity_sigma_px)
         features = labeller.features(frame, cloud, params.labeller, key)
         estimate = labeller.estimate(features.of_frame, params.labeller.numbers)
-        keep, of_frame = kept_points(labeller, features, estimate), features.of_frame
+        labels = labels_of(labeller, features, estimate, params.labeller.numbers)
+        keep, of_frame = labels.keep, features.of_frame
         if _is_soft(labeller, recipe.rule):
             values = jnp.stack(features.map(lambda values: tuple(jnp.moveaxis(values, 1, 0))), axis=-1)
         else:
-            hard = harden(label_points(labeller, frame, cloud, params.labeller, key)[0]).labels
+            hard = harden(labels).labels
             assert hard is not None
             values, of_frame = (hard[:, None] == jnp.arange(classes)).astype(jnp.float32), ()
         window = view_window(recipe.grid, params.camera, pose, max_depth_m, size)
