@@ -45,6 +45,8 @@ class SimulateArguments:
     """Write so many single images, each of another world, as images/ and masks/ for jaxmap train instead."""
     size: tuple[Edge, Edge] = (384, 512)
     """Height and width of the training images."""
+    stereo: bool = False
+    """Training images are left images of rectified pairs, and their disparity is written, too: disparity/, cameras/."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -90,6 +92,7 @@ def _training(arguments: SimulateArguments) -> int:
         height_px=arguments.size[0],
         width_px=arguments.size[1],
         samples=arguments.samples or 4,
+        stereo=arguments.stereo,
     )
     console = Console()
     # A machine that cannot render is refused before a world is made.

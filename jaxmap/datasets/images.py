@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 from PIL import Image
 
 from jaxmap.errors import FrameError, JaxmapError
@@ -41,6 +41,18 @@ def read_image(path: str | PathLike[str]) -> ImageArray:
     """
     pixels = _read_pixels(Path(path))
     return _to_8_bits(pixels, _significant_bits(pixels))
+
+
+def read_deep_image(path: Path) -> UInt16[np.ndarray, "H W"]:
+    """Reads an image of 16-bit numbers as they are.
+
+    Raises:
+        FrameError: the file is missing, truncated, or no 16-bit grey image.
+    """
+    pixels = _read_pixels(path)
+    if pixels.dtype != np.uint16:
+        raise FrameError("not 16-bit grey", where=path, fix="write 16-bit numbers")
+    return pixels
 
 
 def read_index_image(path: Path) -> UInt8[np.ndarray, "H W"]:

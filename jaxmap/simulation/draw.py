@@ -94,6 +94,47 @@ def draw_world(seed: int, kind: SceneKind) -> WorldRecipe:
     )
 
 
+def widen_looks(recipe: WorldRecipe) -> WorldRecipe:
+    """The same world with looks beyond those of beaches: for images to train on, which no two cameras take alike.
+
+    Grounds as dark as basalt or as pale as salt, strong patches, coarse and fine grain, gravel; rocks of the ground's
+    own colour, or none of it; exposures from dim to glaring, lenses from soft to sharp.
+    """
+    draw = Draw(recipe.seed, "looks")
+    sand, stone, exposure = recipe.sand, recipe.stone, recipe.exposure
+    usual, patch, damp = sand.colours
+    if draw.chance(0.3):
+        usual = draw.colour((0, 360), (0.0, 0.45), (0.03, 0.75))
+        damp = as_colour(0.55 * np.array(usual))
+        patch = as_colour(np.clip(np.array(usual) * draw.ratio(0.35, 2.2), 0.01, 0.85))
+    elif draw.chance(0.35):
+        patch = as_colour(np.clip(np.array(patch) * draw.ratio(0.35, 2.2), 0.01, 0.85))
+    colours = stone.colours
+    if draw.chance(0.25):
+        # The rocks of basalt plains have the colour of the ground, a little brighter or darker.
+        colours = tuple(as_colour(np.clip(np.array(usual) * draw.ratio(0.6, 1.6), 0.01, 0.85)) for _ in colours)
+    return replace(
+        recipe,
+        sand=replace(
+            sand,
+            colours=(usual, patch, damp),
+            patch_size_m=draw.ratio(0.25, 6.0),
+            damp_cover=draw.uniform(0.1, 0.6) if draw.chance(0.4) else sand.damp_cover,
+            grain_contrast=sand.grain_contrast * draw.ratio(0.5, 1.8),
+            mottle_contrast=sand.mottle_contrast * draw.ratio(0.5, 2.2),
+            specks_per_m2=draw.ratio(10, 12000),
+        ),
+        stone=replace(stone, colours=colours, contrast=stone.contrast * draw.ratio(0.6, 1.8)),
+        exposure=replace(
+            exposure,
+            level=draw.ratio(0.1, 0.5),
+            contrast=draw.uniform(0.0, 0.6),
+            saturation=draw.uniform(0.0, 0.3) if draw.chance(0.15) else exposure.saturation,
+            blur_px=draw.ratio(0.25, 1.3),
+        ),
+    )
+
+
 def _draw_relief(draw: Draw, kind: SceneKind) -> ReliefRecipe:
     calm = {"few": 0.8, "small": 1.0, "medium": 0.8}.get(kind, draw.ratio(0.5, 1.6))
     bands = ((34.0, 0.28), (11.0, 0.10), (4.2, 0.035), (1.6, 0.017), (0.6, 0.0075), (0.24, 0.0042), (0.1, 0.0022))
