@@ -9,14 +9,18 @@ from .fusion.integrate import integrate
 from .fusion.options import FusionOptions, FusionRule
 from .fusion.params import FusionParams, make_fusion_params
 from .fusion.query import TopDown, class_probabilities, occupancy_probability, top_down, voxel_labels
-from .geometry.camera import PointCloud, depth_sigma, disparity_to_points, points_to_pixels, project, transform_points
+from .geometry.camera import depth_sigma, disparity_to_points, points_to_pixels, transform_points
+from .geometry.cloud import PointCloud, project
 from .geometry.grid import voxel_centres, world_to_voxel
+from .geometry.options import GroundOptions
 from .geometry.plane import fit_plane_mlesac, plane_distance
+from .geometry.relief import Relief, relief_channels, relief_of
 from .labellers.base import Labeller, LabellerParams, make_no_labeller
 from .labellers.deeplab import make_deeplab_labeller
 from .labellers.files import make_files_labeller
-from .labellers.options import DeeplabOptions, PlaneOptions
+from .labellers.options import DeeplabOptions, PlaneOptions, ReliefOptions
 from .labellers.plane import make_plane_labeller
+from .labellers.relief import combine_with_relief, make_relief_labeller
 from .labels import IGNORE, ROVER_CLASSES
 from .mapping.sequence import prepare_frames, run_sequence
 from .mapping.step import Mapper, MapperParams, make_mapper
@@ -45,6 +49,13 @@ from .types import (
 __version__: str
 
 __all__ = [
+    "relief_of",
+    "relief_channels",
+    "make_relief_labeller",
+    "combine_with_relief",
+    "ReliefOptions",
+    "Relief",
+    "GroundOptions",
     "IGNORE",
     "ROVER_CLASSES",
     "Architecture",

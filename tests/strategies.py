@@ -11,7 +11,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from jaxmap.ensemble.options import EnsembleOptions
-from jaxmap.geometry.camera import PointCloud
+from jaxmap.geometry.cloud import PointCloud
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.types import GridSpec, PointLabels, StereoCamera, VoxelMap, make_stereo_camera, make_voxel_map
 

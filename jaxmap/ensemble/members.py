@@ -18,7 +18,7 @@ from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import count_points
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.sensor_model import frame_evidence, point_weights
-from jaxmap.geometry.camera import project
+from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window
 from jaxmap.types import Frame, PointLabels, StereoCamera, VoxelMap
 

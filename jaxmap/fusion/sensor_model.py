@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.geometry.camera import PointCloud
+from jaxmap.geometry.cloud import PointCloud
 from jaxmap.types import GridSpec
 
 _UNROLLED_CLASSES = 8

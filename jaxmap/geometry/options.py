@@ -61,3 +61,19 @@ class PlaneFitOptions:
     """Rounds of expectation maximisation."""
     cost: Literal["mlesac", "msac"] = "mlesac"
     """The score of a plane."""
+
+
+@options("relief")
+class GroundOptions:
+    """The local ground that relief is measured from (`geometry.relief`)."""
+
+    range_m: Annotated[float, Positive] = 12.8
+    """How far ahead the ground is known."""
+    cell_m: Annotated[float, Positive] = 0.1
+    """Edge of a cell of the ground; at long ranges it grows, so that no more than 160 cells lie ahead."""
+    rock_m: Annotated[float, Interval(gt=0, le=20)] = 1.5
+    """What rises on less than this width is no ground."""
+    smooth_m: Annotated[float, Positive] = 0.6
+    """Standard deviation of the neighbourhood that the ground is fitted to."""
+    tolerance_m: Annotated[float, Positive] = 0.06
+    """How far cells of the ground lie from it, beside their noise."""

@@ -9,16 +9,16 @@ the cells turn and move with the camera.
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from annotated_types import Interval
 from jaxtyping import Array, Bool, Float
 
 from jaxmap.geometry.camera import depth_sigma, disparity_to_points
-from jaxmap.host.settings import Positive, options
+from jaxmap.geometry.options import GroundOptions
 from jaxmap.types import StereoCamera
 
 RELIEF_STRIDE = 4
@@ -33,22 +33,6 @@ _RIDGE_M = 0.1
 _MAX_GROUND_SLOPE = 1.2
 
 
-@options("relief")
-class GroundOptions:
-    """The local ground that relief is measured from."""
-
-    range_m: Annotated[float, Positive] = 12.8
-    """How far ahead the ground is known."""
-    cell_m: Annotated[float, Positive] = 0.1
-    """Edge of a cell of the ground; at long ranges it grows, so that no more than 160 cells lie ahead."""
-    rock_m: Annotated[float, Interval(gt=0, le=20)] = 1.5
-    """What rises on less than this width is no ground."""
-    smooth_m: Annotated[float, Positive] = 0.6
-    """Standard deviation of the neighbourhood that the ground is fitted to."""
-    tolerance_m: Annotated[float, Positive] = 0.06
-    """How far cells of the ground lie from it, beside their noise."""
-
-
 class Relief(NamedTuple):
     """Relief of a frame, as images (h, w) whose pixels are `RELIEF_STRIDE` pixels of the disparity wide.
 
@@ -60,6 +44,7 @@ class Relief(NamedTuple):
         step_m: greatest difference of height between the cells around.
         depth_m: of the surface along the optical axis.
         known: where all this is known; elsewhere it is 0.
+        floating: false matches in the air, below which farther ground is seen.
         found: whether there is ground below the camera at all.
     """
 
@@ -70,6 +55,7 @@ class Relief(NamedTuple):
     step_m: Float[Array, "h w"]
     depth_m: Float[Array, "h w"]
     known: Bool[Array, "h w"]
+    floating: Bool[Array, "h w"]
     found: Bool[Array, ""]
 
 
@@ -116,7 +102,8 @@ def relief_of(
         sigma_height_m = jnp.abs(z) * sigma_depth_m / depth_m
         plane, found = _ground_plane(_mean_points(cells, index, (x, y, z), sigma_height_m, inside, focal_px))
         above_m = z - (plane[0] + plane[1] * x + plane[2] * y)
-        inside &= ~_floating(above_m, depth_m, sigma_depth_m, inside)
+        floating = _floating(above_m, depth_m, sigma_depth_m, inside) & found
+        inside &= ~floating
         cell = _mean_points(cells, index, (x, y, z), sigma_height_m, inside, focal_px)
         ground = _fit_ground(cells, cell, plane, found, options)
         at = [jnp.take(field.reshape(-1), index, mode="clip") for field in ground[:6]]
@@ -127,7 +114,7 @@ def relief_of(
         rise = jnp.abs(z - slope_x * x - slope_y * y) / depth_m
         known = inside & (supported > 0) & ground.found
         values = (height_m, rise * sigma_depth_m, _surface_slope(coarse, R[2], blocks_px, valid), roughness_m, step_m, depth_m)
-        return Relief(*(jnp.where(known, value, 0.0) for value in values), known, ground.found)
+        return Relief(*(jnp.where(known, value, 0.0) for value in values), known, floating, ground.found)
 
 
 def relief_channels(relief: Relief) -> Float[Array, "h w 6"]:
@@ -176,8 +163,6 @@ def block_means(disparity_px: Float[Array, "H W"], size: int) -> tuple[Float[Arr
 
 def _coarse_camera(camera: StereoCamera) -> StereoCamera:
     """The camera of the blocks: pixels are larger, and so are disparities in them smaller."""
-    from dataclasses import replace
-
     shift = (RELIEF_STRIDE - 1) / 2
     return replace(
         camera,

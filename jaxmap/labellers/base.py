@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, Shaped
 
 from jaxmap.fusion.bijectors import Bijector
-from jaxmap.geometry.camera import PointCloud
+from jaxmap.geometry.cloud import PointCloud
+from jaxmap.geometry.options import GroundOptions
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, PointLabels
 
@@ -24,18 +25,37 @@ Pointwise = Callable[[Float[Array, "N D *w"]], tuple[Shaped[Array, "N *w"], ...]
 """A function that treats points alike, from their features along axis 1."""
 
 
+class FeatureMap(Protocol):
+    """`PointFeatures.map`."""
+
+    def __call__(
+        self, function: Pointwise, more: Float[Array, "N E"] | None = None
+    ) -> tuple[Shaped[Array, "N"], ...]:
+        """Applies the function."""
+        ...
+
+
+def dense_features(values: Shaped[Array, "N D"]) -> FeatureMap:
+    """The map of features that are held as an array."""
+
+    def map_dense(function: Pointwise, more: Float[Array, "N E"] | None = None) -> tuple[Array, ...]:
+        return function(values if more is None else jnp.concatenate([values, more], axis=1))
+
+    return map_dense
+
+
 class PointFeatures(NamedTuple):
     """Per-point features of a frame: they stay as they are, however the tunable numbers change.
 
     Attributes:
         keep: points to fuse.
         map: applies a pointwise function to the features and gives its arrays (N,). The features need never be held
-            all at once.
+            all at once. Further features (N, E), where they are given, follow the labeller's own.
         of_frame: a pytree of the whole frame.
     """
 
     keep: Bool[Array, "N"]
-    map: Callable[[Pointwise], tuple[Shaped[Array, "N"], ...]]
+    map: FeatureMap
     of_frame: PyTree = ()
 
 
@@ -67,6 +87,7 @@ class Labeller(NamedTuple):
         params: the first ones.
         bijectors: of each tunable number.
         soft: labels are probabilities, which the numbers change smoothly: they can be tuned.
+        ground: where it asks for the relief of the cloud, the ground to measure it from.
     """
 
     name: str
@@ -79,6 +100,7 @@ class Labeller(NamedTuple):
     params: LabellerParams = NO_NUMBERS
     bijectors: Mapping[str, Bijector] = {}
     soft: bool = False
+    ground: GroundOptions | None = None
 
 
 def label_points(
@@ -106,7 +128,7 @@ def make_no_labeller() -> Labeller:
     """Geometry alone: no class at all."""
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
-        return PointFeatures(cloud.in_range.reshape(-1), lambda function: function(cloud.points_world))
+        return PointFeatures(cloud.in_range.reshape(-1), dense_features(cloud.points_world))
 
     def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array]:
         return (jnp.full(values.shape[:1], IGNORE, jnp.int32),)

@@ -13,9 +13,12 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.bijectors import positive
-from jaxmap.geometry.camera import PointCloud
+from jaxmap.geometry.cloud import PointCloud
+from jaxmap.geometry.options import GroundOptions
+from jaxmap.geometry.relief import relief_channels
 from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, Pointwise
 from jaxmap.labellers.options import DeeplabOptions
+from jaxmap.labellers.relief import floating_points
 from jaxmap.labels import IGNORE
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import fold_batch_norm, pure_network
@@ -80,7 +83,8 @@ def make_deeplab_labeller(
 ) -> Labeller:
     """Labels by a network that sees the rectified left image inside the step.
 
-    The labels are those of `jaxmap segment` with the same model and size. A pixel's point is kept
+    Without relief, the labels are those of `jaxmap segment` with the same model and size. A network that was trained
+    with relief sees that of the frame as well. A pixel's point is kept
     whatever its class: what the network gives to classes that the map has not is evidence that
     something is there, and for no class. Logits are divided by the temperature before the softmax
     (Guo et al. 2017, "On Calibration of Modern Neural Networks").
@@ -100,6 +104,7 @@ def make_deeplab_labeller(
             f"there is only a backbone ({saved.architecture.backbone})", where=_WHERE, fix="train a network from it"
         )
     mapped = map_classes(saved.architecture.classes, classes, options.class_map)
+    ground = GroundOptions() if saved.architecture.relief_channels else None
     network = pure_network(*fold_batch_norm(saved.architecture, jax.tree.map(np.asarray, saved.weights)))
     groups = [
         [index for index, target in enumerate(mapped.targets) if target == wanted]
@@ -107,16 +112,21 @@ def make_deeplab_labeller(
     ]
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
-        image = _image(frame)
+        image, keep = _image(frame), cloud.in_range.reshape(-1)
+        relief = None
+        if ground is not None:
+            assert cloud.relief is not None
+            relief, keep = relief_channels(cloud.relief)[None], keep & ~floating_points(cloud)
         with jax.named_scope("network"):
-            coarse = network.apply_coarse(params.weights, resized_input(image[None], options.size_px))[0]
+            coarse = network.apply_coarse(params.weights, resized_input(image[None], options.size_px), relief)[0]
         places = upsampling(network.architecture, coarse.shape[:2], image.shape[:2], options.size_px)
 
-        def map_rows(function: Pointwise) -> tuple[Array, ...]:
+        def map_rows(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
+            more = more if more is None else more.reshape(*image.shape[:2], -1)
             with jax.named_scope("pixel_labels"):
-                return tuple(image.reshape(-1) for image in map_pixels(function, coarse, places))
+                return tuple(image.reshape(-1) for image in map_pixels(function, coarse, places, more))
 
-        return PointFeatures(cloud.in_range.reshape(-1), map_rows)
+        return PointFeatures(keep, map_rows)
 
     def label(logits: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
         if options.soft:
@@ -134,6 +144,7 @@ def make_deeplab_labeller(
         ),
         bijectors={"temperature": positive(0.02, 50.0)},
         soft=options.soft,
+        ground=ground,
     )
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmap.geometry.camera import PointCloud
-from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures
+from jaxmap.geometry.cloud import PointCloud
+from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, dense_features
 from jaxmap.types import Frame
 
 
@@ -20,7 +20,7 @@ def make_files_labeller(classes: Sequence[str], *, soft: bool) -> Labeller:
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
         carried = getattr(frame, needs)
         values = carried.reshape(carried.shape[0] * carried.shape[1], -1)
-        return PointFeatures(cloud.in_range.reshape(-1), lambda function: function(values))
+        return PointFeatures(cloud.in_range.reshape(-1), dense_features(values))
 
     def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
         return tuple(values[:, c] for c in range(len(classes))) if soft else (values[:, 0].astype(jnp.int32),)

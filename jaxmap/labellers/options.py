@@ -6,9 +6,10 @@ from dataclasses import field
 from typing import Annotated
 
 import tyro
+from annotated_types import Interval
 
 from jaxmap.errors import UsageError
-from jaxmap.geometry.options import PlaneFitOptions
+from jaxmap.geometry.options import GroundOptions, PlaneFitOptions
 from jaxmap.host.settings import NotNegative, Positive, options
 
 
@@ -35,6 +36,42 @@ class PlaneOptions(PlaneFitOptions):
                 where="plane",
                 fix="take 0 < threshold_m < max_height_m",
             )
+
+
+@options("relief")
+class ReliefOptions(GroundOptions):
+    """Relief as a labeller, and what it adds to the labels of others (`labellers.relief`).
+
+    The log-odds of rock are `bias + height_gain tanh((height - threshold_m) / hypot(softness_m, noise sigma)) +
+    slope_gain arctan(slope)`. The defaults were fitted on simulated pairs of other worlds than those it is tried on.
+    """
+
+    combine: bool = False
+    """Add relief to the labels of a network or of files; --relief for short."""
+    bias: float = -2.7
+    """Log-odds of rock on level ground of middling height."""
+    threshold_m: Annotated[float, Interval(ge=0, le=2)] = 0.024
+    """Height at which a point is as likely above the ground as on it."""
+    softness_m: Annotated[float, Positive] = 0.02
+    """Width of the passage around the threshold, without noise."""
+    noise: Annotated[float, Positive] = 1.5
+    """Standard deviations of a height that widen the passage."""
+    height_gain: Annotated[float, NotNegative] = 3.0
+    """Greatest change of the log-odds by height."""
+    slope_gain: Annotated[float, NotNegative] = 1.9
+    """Change of the log-odds for each radian of slope."""
+    weight: Annotated[float, NotNegative] = 1.0
+    """Share of relief's log-odds that is added to those of other labels."""
+    offset: float = 1.5
+    """Added to relief's log-odds there: other labels know already that rocks are few."""
+    label_gain: Annotated[float, NotNegative] = 1.0
+    """Factor on the log-odds of the other labels."""
+    certainty: Annotated[float, Interval(gt=0, lt=1)] = 0.9
+    """Probability that a label without a probability of its own is right."""
+    ground: str = "sand"
+    """Class of points on the ground."""
+    rock: str = "rock"
+    """Class of points that rise above it."""
 
 
 def _renaming_from_words(words: list[str]) -> dict[str, str]:

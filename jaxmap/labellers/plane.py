@@ -13,9 +13,9 @@ from jaxtyping import Array
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.bijectors import positive
-from jaxmap.geometry.camera import PointCloud
+from jaxmap.geometry.cloud import PointCloud
 from jaxmap.geometry.plane import PlaneStart, plane_distance, refit_plane, search_plane
-from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures
+from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, dense_features
 from jaxmap.labellers.options import PlaneOptions
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, Plane, to_device
@@ -48,7 +48,7 @@ def make_plane_labeller(classes: Sequence[str], options: PlaneOptions | None = N
         points, keep = cloud.points_world, cloud.in_range.reshape(-1)
         with jax.named_scope("mlesac"):
             start = search_plane(key, points, keep, up_world, params.numbers["sigma_m"], options)
-        return PointFeatures(keep, lambda function: function(points), start)
+        return PointFeatures(keep, dense_features(points), start)
 
     def estimate(start: PlaneStart, numbers: Numbers) -> Plane:
         with jax.named_scope("mlesac"):

@@ -21,7 +21,7 @@ from jaxmap.fusion.integrate import add_evidence, count_points
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
-from jaxmap.geometry.camera import project
+from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, harden, label_points
 from jaxmap.labels import IGNORE
@@ -102,7 +102,7 @@ def fuse_frame(
     grid, camera, pose, fusion = voxel_map.grid, params.camera, frame.T_world_camera, params.fusion
     frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
 
-    cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px)
+    cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
     labels = harden(labels) if rule.per_frame == "once" else labels
     window = view_window(grid, camera, pose, depth_range_m[1], shape)
@@ -135,8 +135,9 @@ def label_image(
 ) -> UInt8[Array, "H W"]:
     """The labels that the step gives the pixels of the frame when `number` frames were fused before it."""
     frame_key = jax.random.fold_in(key, number)
+    sigma_px, ground = params.fusion.disparity_sigma_px, design.labeller.ground
     cloud = project(
-        params.camera, frame.T_world_camera, frame.disparity_px, design.depth_range_m, params.fusion.disparity_sigma_px
+        params.camera, frame.T_world_camera, frame.disparity_px, design.depth_range_m, sigma_px, ground
     )
     labels = harden(label_points(design.labeller, frame, cloud, params.labeller, frame_key)[0])
     assert labels.labels is not None

@@ -78,7 +78,10 @@ def upsampling(
 
 
 def map_pixels(
-    function: Callable[[Float[Array, "R C W"]], tuple[Array, ...]], coarse: Float[Array, "h w C"], places: Upsampling
+    function: Callable[[Float[Array, "R C W"]], tuple[Array, ...]],
+    coarse: Float[Array, "h w C"],
+    places: Upsampling,
+    more: Float[Array, "H W E"] | None = None,
 ) -> tuple[Array, ...]:
     """Applies a function to the logits at all pixels, a few rows at a time.
 
@@ -86,6 +89,7 @@ def map_pixels(
         function: from the logits of R rows to images (R, W); it must treat pixels alike.
         coarse: the coarse logits.
         places: where the pixels lie among them.
+        more: further numbers of each pixel, which follow the logits.
 
     Returns:
         The images (H, W) that the function gives.
@@ -97,8 +101,8 @@ def map_pixels(
 
     # On the way back the logits are computed anew, so that they are never all held there either.
     @jax.checkpoint
-    def block(band: tuple[Int[Array, ""], Float[Array, "R near"]]) -> tuple[Array, ...]:
-        start, weights = band
+    def block(band: tuple[Int[Array, ""], Float[Array, "R near"], Array | None]) -> tuple[Array, ...]:
+        start, weights, beside = band
         near = jax.lax.dynamic_slice_in_dim(coarse, start, weights.shape[1])
         lines = jnp.einsum("Rn,ncw->Rcw", weights, near, precision=PRECISION)
         parts = [
@@ -106,10 +110,16 @@ def map_pixels(
             for first, weights in zip(columns.starts.tolist(), columns.weights, strict=True)
         ]
         logits = jnp.concatenate(parts, axis=-1)[..., :width]
+        if beside is not None:
+            logits = jnp.concatenate([logits, beside], axis=1)
         # Without the barrier they would be computed anew for each use.
         return function(jax.lax.optimization_barrier(logits))
 
-    images = jax.lax.map(block, (jnp.asarray(rows.starts), jnp.asarray(rows.weights)))
+    if more is not None:
+        missing = len(rows.starts) * _BLOCK_ROWS - height
+        more = jnp.swapaxes(jnp.pad(more, ((0, missing), (0, 0), (0, 0))), 1, 2)
+        more = more.reshape(-1, _BLOCK_ROWS, *more.shape[1:])
+    images = jax.lax.map(block, (jnp.asarray(rows.starts), jnp.asarray(rows.weights), more))
     return tuple(image.reshape(-1, width)[:height] for image in images)
 
 

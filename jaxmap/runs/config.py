@@ -13,10 +13,10 @@ from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.fusion.options import FusionOptions
 from jaxmap.geometry.options import DepthOptions, GridOptions
 from jaxmap.host.settings import NotNegative, Settings, options
-from jaxmap.labellers.options import DeeplabOptions, PlaneOptions
+from jaxmap.labellers.options import DeeplabOptions, PlaneOptions, ReliefOptions
 from jaxmap.stereo.match import StereoOptions
 
-LabellerName = Literal["plane", "deeplab", "files", "none"]
+LabellerName = Literal["plane", "relief", "deeplab", "files", "none"]
 
 
 @options("")
@@ -24,7 +24,7 @@ class MapConfig(ReadOptions):
     """Everything that decides what a map comes out as."""
 
     labeller: LabellerName = "plane"
-    """What labels the points: the MLESAC plane, a network, files of labels, or nothing."""
+    """What labels the points: the MLESAC plane, relief above the local ground, a network, files of labels, or nothing."""
     model: Path | None = None
     """Model file of the network, with the deeplab labeller (train and weights import write them); by default the
     bundled one, for rovers on sand."""
@@ -47,6 +47,7 @@ class MapConfig(ReadOptions):
     stereo: StereoOptions = field(default_factory=StereoOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
     plane: PlaneOptions = field(default_factory=PlaneOptions)
+    relief: ReliefOptions = field(default_factory=ReliefOptions)
     deeplab: DeeplabOptions = field(default_factory=DeeplabOptions)
     ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
 

@@ -19,7 +19,7 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import CellGrid
 from jaxmap.evaluation.evaluate import evaluate_map
 from jaxmap.evaluation.options import ScoringOptions
-from jaxmap.geometry.camera import project
+from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.files import bundled
 from jaxmap.host.prefetch import prefetch

@@ -27,6 +27,7 @@ from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller
+from jaxmap.labellers.relief import combine_with_relief, make_relief_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.sequence import frame_form
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
@@ -196,14 +197,25 @@ def choose_labeller(config: MapConfig, label_folder: LabelFolder | None, network
     classes = config.classes
     if classes is not None and len(set(classes)) < len(classes):
         raise UsageError(f"a class is named twice: {' '.join(classes)}", fix="give each class once")
+    if config.relief.combine and config.labeller not in ("deeplab", "files"):
+        raise UsageError(
+            f"--relief is given, but the labeller is {config.labeller}",
+            fix="add --labeller deeplab or files, or take --labeller relief",
+        )
     if network is not None:
-        return make_deeplab_labeller(network, classes, config.deeplab)
+        return _with_relief(make_deeplab_labeller(network, classes, config.deeplab), config)
     classes = ROVER_CLASSES if classes is None else classes
     if label_folder is not None:
-        return make_files_labeller(classes, soft=label_folder.soft)
+        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config)
+    if config.labeller == "relief":
+        return make_relief_labeller(classes, config.relief)
     if config.labeller == "plane":
         return make_plane_labeller(classes, config.plane)
     return make_no_labeller()
+
+
+def _with_relief(labeller: Labeller, config: MapConfig) -> Labeller:
+    return combine_with_relief(labeller, config.relief) if config.relief.combine else labeller
 
 
 Notify = Callable[[str], None]

@@ -26,7 +26,8 @@ from jaxmap.fusion.carve import carve
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, range_weight
-from jaxmap.geometry.camera import depth_sigma, project
+from jaxmap.geometry.camera import depth_sigma
+from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import flat_voxel_index, view_window, whole_window, window_shape
 from jaxmap.labellers.base import Labeller, Numbers, harden, labels_of
 from jaxmap.mapping.step import MapperParams
@@ -134,7 +135,14 @@ def _observer(recipe: CacheRecipe) -> Any:
     @jax.jit
     def observe(frame: Frame, params: MapperParams, key: PRNGKeyArray) -> dict[str, Any]:
         pose, fusion = frame.T_world_camera, params.fusion
-        cloud = project(params.camera, pose, frame.disparity_px, recipe.depth_range_m, fusion.disparity_sigma_px)
+        cloud = project(
+            params.camera,
+            pose,
+            frame.disparity_px,
+            recipe.depth_range_m,
+            fusion.disparity_sigma_px,
+            labeller.ground,
+        )
         features = labeller.features(frame, cloud, params.labeller, key)
         estimate = labeller.estimate(features.of_frame, params.labeller.numbers)
         labels = labels_of(labeller, features, estimate, params.labeller.numbers)
