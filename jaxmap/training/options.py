@@ -160,6 +160,6 @@ class NetworkOptions:
     low_level_channels: Annotated[int, Interval(ge=1, le=4096)] | None = None
     """Channels the low-level feature is reduced to."""
     top_conv: bool | None = None
-    """Whether MobileNetV2 keeps its last convolution, to 1280 channels."""
+    """Whether MobileNetV2 or EfficientNet-Lite0 keeps its last convolution, to 1280 channels."""
     dropout: Share | None = None
     """Share of ASPP features dropped while training."""
