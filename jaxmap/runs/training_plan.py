@@ -241,6 +241,7 @@ def plan_image_training(
         steps=order.steps,
         class_weights=jnp.asarray(class_weights(config.loss, counts[0])),
         batch_norms=network.batch_norms,
+        negated=training_set.lookup.negated,
     )
     data = ImageTrainingData(training_set, counts, ExampleReader(training_set.train, training_set.lookup))
     return TrainingPlan(config, data, network, init, order, trainer)

@@ -115,7 +115,7 @@ def read_example(example: Example, lookup: MaskLookup) -> tuple[Pixels, Labels]:
 
     Returns:
         image: uint8 (H, W, 3).
-        labels: uint8 (H, W): class indices, and 255 for none.
+        labels: uint8 (H, W): class indices, 255 for none, and 254 for any class but the negated one.
 
     Raises:
         JaxmapError: a file cannot be read, they differ in size, or a pixel of the mask stands for nothing.
@@ -170,7 +170,7 @@ def digest(training_set: TrainingSet) -> str:
         JaxmapError: a file is missing.
     """
     text = hashlib.sha256(training_set.lookup.table.tobytes())
-    text.update(repr((training_set.classes, training_set.lookup.kind)).encode())
+    text.update(repr((training_set.classes, training_set.lookup.kind, training_set.lookup.negated)).encode())
     for part in (training_set.train, training_set.validation):
         text.update(f"{len(part)}\n".encode())
         for example in part:

@@ -25,7 +25,8 @@ class DataOptions:
     """What the pixels of masks stand for, and which images validate."""
 
     remap: dict[MaskValue, str] | None = None
-    """Class by value of the masks, such as 255 rock; "ignore" is no class, and the value * every other."""
+    """Class by value of the masks, such as 255 rock; "ignore" is no class, "not rock" any class but that one, and the
+    value * every other."""
     palette: dict[str, str] | None = None
     """Colour of the masks by class, such as rock #ff0000; several of a class with blanks between."""
     validation_share: Share = 0.2

@@ -15,7 +15,7 @@ from jaxmap.labels import IGNORE
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, training_form
 from jaxmap.training.augment import augment
-from jaxmap.training.losses import total_loss
+from jaxmap.training.losses import correct, total_loss
 from jaxmap.training.options import OptimiserOptions, TrainingOptions
 
 _STATISTICS = (".norm.mean", ".norm.var")
@@ -89,6 +89,7 @@ def make_trainer(
     steps: int,
     class_weights: Float[Array, "C"],
     batch_norms: tuple[str, ...] = (),
+    negated: int | None = None,
 ) -> Trainer:
     """Builds the functions of a training run.
 
@@ -98,6 +99,7 @@ def make_trainer(
         steps: of the whole run, for the schedule.
         class_weights: of the cross-entropy.
         batch_norms: prefixes of the blocks whose batch norms train; the others are frozen.
+        negated: the class that pixels labelled `ANY_OTHER` are not of.
     """
     network = training_form(architecture, batch_norms)
     updater = make_updater(options, steps)
@@ -105,7 +107,7 @@ def make_trainer(
 
     def loss(weights: Weights, images: Array, labels: Array, key: Array) -> tuple[Array, tuple[Array, Weights]]:
         logits, statistics = network(weights, images, key)
-        return total_loss(logits, labels, class_weights, options.loss), (logits, statistics)
+        return total_loss(logits, labels, class_weights, options.loss, negated), (logits, statistics)
 
     def examples(batch: Batch, key: Array) -> tuple[Array, Array]:
         def one(image: Array, labels: Array, size_px: Array, draw: Array, original: Array) -> tuple[Array, Array]:
@@ -125,7 +127,7 @@ def make_trainer(
 
         (value, (logits, statistics)), gradient = jax.value_and_grad(of_trained, has_aux=True)(trained)
         known = labels != IGNORE
-        right = known & (logits.argmax(axis=-1) == labels)
+        right = known & correct(logits.argmax(axis=-1), labels, negated)
         accuracy = right.sum() / jnp.maximum(known.sum(), 1)
         return updater.update(state, value, accuracy, gradient, statistics)
 
