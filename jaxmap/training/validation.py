@@ -16,6 +16,7 @@ from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, fold_batch_norm, pure_network
 from jaxmap.training.data import Example, read_example
 from jaxmap.training.masks import MaskLookup
+from jaxmap.training.relief import read_relief
 
 MAX_EXAMPLES = 6
 """Images of a validation that are kept for the report."""
@@ -74,7 +75,8 @@ class ImageValidator:
         places = set(np.linspace(0, len(self._examples) - 1, MAX_EXAMPLES).round().astype(int).tolist())
         for place, example in enumerate(self._examples):
             image, truth = read_example(example, self._lookup)
-            logits = np.asarray(self._run(folded, image[None])[0])  # type: ignore[operator]
+            relief = read_relief(example)[None] if self._architecture.relief_channels else None
+            logits = np.asarray(self._run(folded, image[None], relief)[0])  # type: ignore[operator]
             if not np.isfinite(logits).all():
                 raise JaxmapError(
                     "the network's output for a validation image is not finite",
