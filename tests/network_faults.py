@@ -225,6 +225,11 @@ def copied(folder: Path, name: str) -> Path:
     return folder / "checkpoint.pth"
 
 
+def pickled(folder: Path) -> Path:
+    (folder / "checkpoint.pth").write_bytes(pickle.dumps({"w": [1.0, 2.0]}, protocol=2))
+    return folder / "checkpoint.pth"
+
+
 class Bomb:
     """What a pickle can do when it is loaded."""
 
@@ -276,7 +281,8 @@ IMPORT_FAULTS: dict[str, tuple[int, Callable[[Path], list[str]]]] = {
     "no checkpoint": (1, lambda folder: import_words(folder / "nowhere.pth")),
     "truncated checkpoint": (1, lambda folder: import_words(cut(saved(folder, resnet18_state()), 0.5))),
     "truncated .pth": (1, lambda folder: import_words(cut(copied(folder, "tiny.pth"), 0.5))),
-    ".pth of the old format": (1, lambda folder: import_words(copied(folder, "tiny_legacy.pth"))),
+    "truncated .pth of the old format": (1, lambda folder: import_words(cut(copied(folder, "tiny_legacy.pth"), 0.95))),
+    ".pth that PyTorch did not write": (1, lambda folder: import_words(pickled(folder))),
     "pickle bomb": (1, lambda folder: import_words(zipped(folder, pickle.dumps({"w": Bomb()}, protocol=2)))),
     "zip bomb": (1, lambda folder: import_words(zipped(folder, huge_tensor(), zipfile.ZIP_DEFLATED))),
     "huge declared tensor": (1, lambda folder: import_words(zipped(folder, huge_tensor()))),

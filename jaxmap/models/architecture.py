@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from jaxmap.errors import JaxmapError
 
-Backbone = Literal["mobilenet_v2", "resnet18", "resnet50", "resnet101", "xception65"]
+Backbone = Literal["mobilenet_v2", "efficientnet_lite0", "resnet18", "resnet50", "resnet101", "xception65"]
 Padding = Literal["torch", "same"]
 Norm = Literal["batch", "bias", "none"]
 Activation = Literal["relu", "relu6", "none"]
@@ -21,6 +21,9 @@ BACKBONES: tuple[str, ...] = get_args(Backbone)
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+LITE_MEAN = (127 / 255,) * 3
+LITE_STD = (128 / 255,) * 3
+"""The weights of EfficientNet-Lite0 were trained on (x - 127) / 128."""
 MAX_CLASSES = 255
 """Label images are 8-bit and keep 255 for "no class"."""
 
@@ -62,7 +65,7 @@ class Architecture:
         head_norm: the same of ASPP and decoder.
         backbone_eps: epsilon of the backbone's batch norm.
         head_eps: epsilon of the head's.
-        top_conv: whether MobileNetV2 keeps its last 1x1 convolution (to 1280 channels).
+        top_conv: whether MobileNetV2 or EfficientNet-Lite0 keeps its last 1x1 convolution (to 1280 channels).
         head_channels: channels of ASPP and decoder.
         atrous_rates: dilations of the ASPP branches beside the 1x1 one; none at all is allowed.
         separable_aspp: whether those branches, and the convolution after the ASPP, are depthwise separable.
@@ -121,13 +124,25 @@ class Architecture:
             raise JaxmapError(faults, where="architecture", fix="correct the architecture") from error
 
 
+_LITE: dict[str, Any] = {
+    "padding": "same",
+    "dilate_first": False,
+    "backbone_eps": 1e-3,
+    "mean": LITE_MEAN,
+    "std": LITE_STD,
+}
+"""What the weights of EfficientNet-Lite0 were trained with."""
+
+
 def torch_architecture(backbone: str, classes: Sequence[str], *, output_stride: int = 16) -> Architecture:
     """DeepLabv3+ with the details of segmentation_models_pytorch.
+
+    EfficientNet-Lite0 keeps the conventions of TensorFlow, where its published weights were trained.
 
     Raises:
         JaxmapError: an unknown backbone or stride, or invalid classes.
     """
-    return _architecture(backbone, classes, output_stride)
+    return _architecture(backbone, classes, output_stride, **(_LITE if backbone == "efficientnet_lite0" else {}))
 
 
 def tf_architecture(
@@ -135,34 +150,34 @@ def tf_architecture(
 ) -> Architecture:
     """DeepLabv3 or v3+ with the details of the original TensorFlow networks.
 
-    On MobileNetV2 the original goes without atrous branches and without the last convolution.
-    Only MobileNetV2 pads as TensorFlow does by itself; Xception and ResNet pad both sides alike.
+    On MobileNetV2 the original goes without atrous branches and without the last convolution; so does
+    EfficientNet-Lite0 here. Only these two pad as TensorFlow does by itself; Xception and ResNet pad both sides alike.
     Backbones keep the layout of the weights that are published for them: ResNet is torchvision's (stride in
     a stage's first unit), and MobileNetV2's low-level feature is a unit's output (24 channels).
 
     Raises:
         JaxmapError: an unknown backbone or stride, or invalid classes.
     """
-    mobile = backbone == "mobilenet_v2"
-    return _architecture(
-        backbone,
-        classes,
-        output_stride,
-        decoder=decoder,
-        padding="same" if mobile else "torch",
-        size_remainder=1,
-        dilate_first=False,
-        backbone_eps=1e-5 if backbone.startswith("resnet") else 1e-3,
-        top_conv=False,
-        atrous_rates=() if mobile else (6, 12, 18) if output_stride == 16 else (12, 24, 36),
-        pool_first=True,
-        norm_inside=True,
-        aspp_conv=False,
-        decoder_convs=2,
-        dropout=0.1,
-        mean=(0.5, 0.5, 0.5),
-        std=(0.5, 0.5, 0.5),
-    )
+    mobile = backbone in ("mobilenet_v2", "efficientnet_lite0")
+    details: dict[str, Any] = {
+        "decoder": decoder,
+        "padding": "same" if mobile else "torch",
+        "size_remainder": 1,
+        "dilate_first": False,
+        "backbone_eps": 1e-5 if backbone.startswith("resnet") else 1e-3,
+        "top_conv": False,
+        "atrous_rates": () if mobile else (6, 12, 18) if output_stride == 16 else (12, 24, 36),
+        "pool_first": True,
+        "norm_inside": True,
+        "aspp_conv": False,
+        "decoder_convs": 2,
+        "dropout": 0.1,
+        "mean": (0.5, 0.5, 0.5),
+        "std": (0.5, 0.5, 0.5),
+    }
+    if backbone == "efficientnet_lite0":
+        details |= _LITE
+    return _architecture(backbone, classes, output_stride, **details)
 
 
 def torchvision_architecture(backbone: str, classes: Sequence[str], *, output_stride: int = 8) -> Architecture:

@@ -1,11 +1,13 @@
-"""Networks without their classifiers, as feature extractors: MobileNetV2, ResNet-18, 50 and 101, Xception-65.
+"""Networks without their classifiers, as feature extractors.
+
+MobileNetV2, EfficientNet-Lite0, ResNet-18, 50 and 101, Xception-65.
 
 Each gives its features at the output stride and, for the decoder, a low-level feature at stride 4.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from flax import nnx
 from jaxtyping import Array, Float
@@ -14,21 +16,44 @@ from jaxmap.models.architecture import Architecture, Padding
 from jaxmap.models.convolutions import max_pool
 from jaxmap.models.layers import ConvBlock, SeparableBlock
 
-MOBILENET_STAGES = (
-    (1, 16, 1, 1),
-    (6, 24, 2, 2),
-    (6, 32, 3, 2),
-    (6, 64, 4, 2),
-    (6, 96, 3, 1),
-    (6, 160, 3, 2),
-    (6, 320, 1, 1),
-)
-"""Expansion, channels, units and first stride of each stage (Sandler et al. 2018, table 2)."""
 
-MOBILENET_LOW_LEVEL_UNIT = 2
-"""The unit whose output is the low-level feature: the last at stride 4, 24 channels."""
+class Stage(NamedTuple):
+    """Inverted residuals in a row: expansion, channels, units, stride of the first, size of the depthwise kernel."""
 
-MOBILENET_TOP_CHANNELS = 1280
+    expansion: int
+    channels: int
+    units: int
+    stride: int
+    size: int = 3
+
+
+INVERTED_RESIDUAL_STAGES = {
+    # Sandler et al. 2018, table 2.
+    "mobilenet_v2": (
+        Stage(1, 16, 1, 1),
+        Stage(6, 24, 2, 2),
+        Stage(6, 32, 3, 2),
+        Stage(6, 64, 4, 2),
+        Stage(6, 96, 3, 1),
+        Stage(6, 160, 3, 2),
+        Stage(6, 320, 1, 1),
+    ),
+    # EfficientNet-B0 (Tan & Le 2019, table 1).
+    "efficientnet_lite0": (
+        Stage(1, 16, 1, 1),
+        Stage(6, 24, 2, 2),
+        Stage(6, 40, 2, 2, 5),
+        Stage(6, 80, 3, 2),
+        Stage(6, 112, 3, 1, 5),
+        Stage(6, 192, 4, 2, 5),
+        Stage(6, 320, 1, 1),
+    ),
+}
+
+LOW_LEVEL_UNIT = 2
+"""The inverted residual whose output is the low-level feature: the last at stride 4, 24 channels."""
+
+TOP_CHANNELS = 1280
 
 RESNET_UNITS = {"resnet18": (2, 2, 2, 2), "resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}
 """Units of each stage (He et al. 2015, table 1)."""
@@ -77,15 +102,15 @@ def dilations(strides: list[int], start: int, record: Architecture) -> list[tupl
 
 
 class InvertedResidual(nnx.Module):
-    """1x1 expansion, 3x3 depthwise, 1x1 projection without activation, added to the input where both fit."""
+    """1x1 expansion, depthwise, 1x1 projection without activation, added to the input where both fit."""
 
     def __init__(
-        self, inputs: int, outputs: int, expansion: int, stride: int, dilation: int, record: Architecture
+        self, inputs: int, outputs: int, expansion: int, stride: int, dilation: int, record: Architecture, size: int = 3
     ) -> None:
         hidden, common = inputs * expansion, _conventions(record)
         self.expand = ConvBlock(inputs, hidden, activation="relu6", **common) if expansion > 1 else None
         self.depthwise = ConvBlock(
-            hidden, hidden, 3, stride=stride, dilation=dilation, depthwise=True, activation="relu6", **common
+            hidden, hidden, size, stride=stride, dilation=dilation, depthwise=True, activation="relu6", **common
         )
         self.project = ConvBlock(hidden, outputs, activation="none", **common)
         self.shortcut = stride == 1 and inputs == outputs
@@ -97,26 +122,32 @@ class InvertedResidual(nnx.Module):
         return images + result if self.shortcut else result
 
 
-class MobileNetV2(nnx.Module):
-    """MobileNetV2 at width 1 (Sandler et al. 2018, "Inverted Residuals and Linear Bottlenecks")."""
+class InvertedResidualNet(nnx.Module):
+    """A chain of inverted residuals.
+
+    MobileNetV2 at width 1 (Sandler et al. 2018, "Inverted Residuals and Linear Bottlenecks"), or EfficientNet-Lite0:
+    EfficientNet-B0 (Tan & Le 2019) without squeeze-and-excitation, and with ReLU6 in the place of swish.
+    """
 
     def __init__(self, record: Architecture) -> None:
         common = _conventions(record)
         self.stem = ConvBlock(3, 32, 3, stride=2, activation="relu6", **common)
         designs = [
-            (expansion, channels, stride if unit == 0 else 1)
-            for expansion, channels, count, stride in MOBILENET_STAGES
-            for unit in range(count)
+            (stage, stage.stride if unit == 0 else 1)
+            for stage in INVERTED_RESIDUAL_STAGES[record.backbone]
+            for unit in range(stage.units)
         ]
-        placed = dilations([stride for _, _, stride in designs], 2, record)
+        placed = dilations([stride for _, stride in designs], 2, record)
         units, inputs = [], 32
-        for (expansion, channels, _), (stride, dilation) in zip(designs, placed, strict=True):
-            units.append(InvertedResidual(inputs, channels, expansion, stride, dilation, record))
-            inputs = channels
+        for (stage, _), (stride, dilation) in zip(designs, placed, strict=True):
+            units.append(
+                InvertedResidual(inputs, stage.channels, stage.expansion, stride, dilation, record, stage.size)
+            )
+            inputs = stage.channels
         self.units = nnx.List(units)
-        self.top = ConvBlock(inputs, MOBILENET_TOP_CHANNELS, activation="relu6", **common) if record.top_conv else None
-        self.channels = MOBILENET_TOP_CHANNELS if record.top_conv else inputs
-        self.low_level_channels = designs[MOBILENET_LOW_LEVEL_UNIT][1]
+        self.top = ConvBlock(inputs, TOP_CHANNELS, activation="relu6", **common) if record.top_conv else None
+        self.channels = TOP_CHANNELS if record.top_conv else inputs
+        self.low_level_channels = designs[LOW_LEVEL_UNIT][0].channels
 
     def __call__(self, images: Float[Array, "B H W 3"]) -> Features:
         """The features, and the low-level feature."""
@@ -124,7 +155,7 @@ class MobileNetV2(nnx.Module):
         low_level = images
         for index, unit in enumerate(self.units):
             images = unit(images)
-            if index == MOBILENET_LOW_LEVEL_UNIT:
+            if index == LOW_LEVEL_UNIT:
                 low_level = images
         return images if self.top is None else self.top(images), low_level
 

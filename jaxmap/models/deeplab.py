@@ -14,7 +14,13 @@ from flax import nnx
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, UInt8
 
 from jaxmap.models.architecture import Architecture, folded
-from jaxmap.models.backbones import RESNET_UNITS, MobileNetV2, ResNet, Xception65
+from jaxmap.models.backbones import (
+    INVERTED_RESIDUAL_STAGES,
+    RESNET_UNITS,
+    InvertedResidualNet,
+    ResNet,
+    Xception65,
+)
 from jaxmap.models.convolutions import winograd_kernel
 from jaxmap.models.heads import Aspp, Decoder
 from jaxmap.models.layers import ConvBlock
@@ -30,8 +36,8 @@ AnyArray = Array | np.ndarray
 Images = UInt8[Array, "B H W 3"] | Float[Array, "B H W 3"]
 """RGB, 0 to 255, of any size."""
 
-_BACKBONES: dict[str, Callable[[Architecture], MobileNetV2 | ResNet | Xception65]] = {
-    "mobilenet_v2": MobileNetV2,
+_BACKBONES: dict[str, Callable[[Architecture], InvertedResidualNet | ResNet | Xception65]] = {
+    **dict.fromkeys(INVERTED_RESIDUAL_STAGES, InvertedResidualNet),
     **dict.fromkeys(RESNET_UNITS, ResNet),
     "xception65": Xception65,
 }

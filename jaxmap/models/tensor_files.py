@@ -8,21 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models.torch_files import read_torch_zip
-
-Tensors = dict[str, np.ndarray]
+from jaxmap.models.torch_files import Tensors, read_torch_file
 
 _FLOATS = {"F16": np.float16, "F32": np.float32, "F64": np.float64}
 
 
 def read_tensors(path: Path) -> Tensors:
-    """The tensors of a `.safetensors` file or of a PyTorch zip (`.pth`, `.pt`, `.bin`), by name.
+    """The tensors of a `.safetensors` file or of one of PyTorch's (`.pth`, `.pt`, `.bin`), by name.
 
     Raises:
         JaxmapError: the file is missing, truncated, of another kind, or asks for more than tensors.
     """
     if path.suffix.lower() in (".pth", ".pt", ".bin", ".ckpt", ".tar"):
-        return read_torch_zip(path)
+        return read_torch_file(path)
     return read_safetensors(path)[1]
 
 

@@ -1,82 +1,56 @@
-"""PyTorch's zip files of tensors, read without unpickling.
+"""PyTorch's files of tensors, read without unpickling.
 
-Such a zip holds `NAME/data.pkl`, a pickle that describes the tensors, and `NAME/data/KEY`, their raw numbers.
-
-A pickle is a program. It is never given to Python's own reader: the stack machine below interprets only the few
-instructions that describe dicts of tensors, and refuses by name every function or class that is not a tensor's.
-Nothing is imported or called that the file asks for.
-
-A small program can name one value twice, that pair twice, and so on: walking through such a value
-(hashing, printing, copying) never ends. So only text and numbers are keys, only names are called,
-and no list is copied that the file can name again.
+Since 1.6 PyTorch writes a zip that holds `NAME/data.pkl`, a pickle that describes the tensors, and `NAME/data/KEY`,
+their raw numbers. Before, it wrote five pickles (a magic number, the version, facts about the machine, the
+description, the keys of the storages) and after them, for each key, how many numbers there are and the numbers.
 """
 
 from __future__ import annotations
 
+import io
 import math
-import pickletools
+import os
+import struct
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
 import numpy as np
 
 from jaxmap.errors import JaxmapError
+from jaxmap.models.torch_pickle import Refused, Storage, StoredTensor, interpret, short
 
 MAX_PROGRAM_BYTES = 4 * 2**20
 """A description takes some 200 bytes for each tensor."""
 MAX_SHARING = 4
 """Tensors may share numbers, but not so that a small file fills the memory."""
-MAX_AXES = 16
 
 _WRAPPERS = ("state_dict", "model_state_dict", "model", "net", "network")
 _ZIP_START = b"PK\x03\x04"
+_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
+_LEGACY_VERSION = 1001
 
-_STORAGES = {
-    "DoubleStorage": "f8",
-    "FloatStorage": "f4",
-    "HalfStorage": "f2",
-    "LongStorage": "i8",
-    "IntStorage": "i4",
-    "ShortStorage": "i2",
-    "CharStorage": "i1",
-    "ByteStorage": "u1",
-    "BoolStorage": "?",
-}
-_FUNCTIONS = ("collections.OrderedDict", "torch._utils._rebuild_parameter", "torch._utils._rebuild_tensor_v2")
-_MARK = object()
+Tensors = dict[str, np.ndarray]
 
 
-def read_torch_zip(path: Path) -> dict[str, np.ndarray]:
+def read_torch_file(path: Path) -> Tensors:
     """The float tensors of a state dict, also where it lies under `state_dict` or `model`.
 
     Raises:
-        JaxmapError: the file is missing, truncated, of the format before PyTorch 1.6, or holds
-            anything but tensors and plain values.
+        JaxmapError: the file is missing, truncated, or holds anything but tensors and plain values.
     """
     if not path.is_file():
         raise JaxmapError("no such file", where=path, fix="give a .safetensors or .pth file of weights")
     try:
         with path.open("rb") as file:
-            starts_as_zip = file.read(4) == _ZIP_START
-    except OSError as fault:
-        raise JaxmapError(f"cannot be read ({fault.strerror or fault})", where=path, fix="check the file") from fault
-    if not starts_as_zip:
-        raise JaxmapError(
-            "not the zip that PyTorch writes since 1.6",
-            where=path,
-            fix="convert it where PyTorch is installed: safetensors.torch.save_file(torch.load(FILE, "
-            "weights_only=True), 'weights.safetensors')",
-        )
-    try:
-        with zipfile.ZipFile(path) as archive:
-            tensors = _read(archive, path.stat().st_size)
+            tensors = _read(file)
     except Refused as fault:
         raise JaxmapError(
             str(fault), where=path, fix="save only the state dict, best as safetensors: safetensors.torch.save_file"
         ) from fault
+    except OSError as fault:
+        raise JaxmapError(f"cannot be read ({fault.strerror or fault})", where=path, fix="check the file") from fault
     except Exception as fault:
         # Damaged bytes make the parsers raise any exception.
         reason = " ".join(str(fault)[:1000].split())[:120] or type(fault).__name__
@@ -86,7 +60,18 @@ def read_torch_zip(path: Path) -> dict[str, np.ndarray]:
     return tensors
 
 
-def _read(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, np.ndarray]:
+def _read(file: BinaryIO) -> Tensors:
+    file_bytes = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    start = file.read(len(_ZIP_START))
+    file.seek(0)
+    if start == _ZIP_START:
+        with zipfile.ZipFile(file) as archive:
+            return _read_zip(archive, file_bytes)
+    return _read_legacy(file, file_bytes)
+
+
+def _read_zip(archive: zipfile.ZipFile, file_bytes: int) -> Tensors:
     if sum(info.compress_size for info in archive.infolist()) > file_bytes:
         raise Refused("members that are larger than the file, or share its bytes")
     programs = [name for name in archive.namelist() if name.endswith("data.pkl") and name.count("/") <= 1]
@@ -94,13 +79,63 @@ def _read(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, np.ndarray]:
         raise Refused("no data.pkl, so it is no PyTorch file")
     root = programs[0].removesuffix("data.pkl")
     order = ">" if _member(archive, f"{root}byteorder", 16, optional=True).strip() == b"big" else "<"
-    content = interpret(_member(archive, programs[0], MAX_PROGRAM_BYTES))
+    content = interpret(_member(archive, programs[0], MAX_PROGRAM_BYTES)).content
+    buffers: dict[str, bytes] = {}
+
+    def numbers(storage: Storage) -> bytes:
+        if storage.key not in buffers:
+            buffers[storage.key] = _member(archive, f"{root}data/{storage.key}", storage.bytes)
+        return buffers[storage.key]
+
+    return _tensors(content, numbers, order, file_bytes)
+
+
+def _read_legacy(file: BinaryIO, file_bytes: int) -> Tensors:
+    programs = io.BytesIO(file.read(MAX_PROGRAM_BYTES))
+    try:
+        magic = interpret(programs).content
+    except Exception as fault:
+        raise Refused("no file of PyTorch's") from fault
+    if magic != _LEGACY_MAGIC or interpret(programs).content != _LEGACY_VERSION:
+        raise Refused("no file of PyTorch's")
+    interpret(programs)  # Sizes of C's types where it was written, which do not matter: numbers are little-endian.
+    content, storages = interpret(programs)
+    keys = interpret(programs).content
+    file.seek(programs.tell())
+    sizes: dict[str, Storage] = {}
+    for storage in storages:
+        if sizes.setdefault(storage.key, storage) != storage:
+            raise Refused(f"storage {short(storage.key)} has two sizes")
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys) or sorted(keys) != sorted(sizes):
+        raise Refused("a list of storages that is not that of the tensors")
+    buffers: dict[str, bytes] = {}
+    for key in keys:
+        (count,) = struct.unpack("<q", file.read(8))
+        size, left = sizes[key].bytes, file_bytes - file.tell()
+        if count != sizes[key].count:
+            raise Refused(f"storage {short(key)} should hold {short(size)} bytes, the file says otherwise")
+        if size > left:
+            raise ValueError(f"storage {short(key)} should hold {short(size)} bytes, {left} are left")
+        buffers[key] = file.read(size)
+    if file.tell() != file_bytes:
+        raise Refused("bytes after the last storage")
+    return _tensors(content, lambda storage: buffers[storage.key], "<", file_bytes)
+
+
+def _tensors(content: object, numbers: Callable[[Storage], bytes], order: str, file_bytes: int) -> Tensors:
+    """The float tensors of what a program describes.
+
+    Args:
+        content: the description.
+        numbers: gives the bytes of a storage.
+        order: of the bytes of a number, as NumPy writes it.
+        file_bytes: size of the file, which bounds that of the tensors.
+    """
     if isinstance(content, dict):
         content = next((content[name] for name in _WRAPPERS if isinstance(content.get(name), dict)), content)
     if not isinstance(content, dict):
         raise Refused("no dict of tensors")
-    buffers: dict[str, bytes] = {}
-    tensors: dict[str, np.ndarray] = {}
+    tensors: Tensors = {}
     total = 0
     for name, value in content.items():
         if isinstance(name, str) and isinstance(value, StoredTensor) and "f" in value.storage.dtype:
@@ -111,7 +146,7 @@ def _read(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, np.ndarray]:
             total += value.check()
             if total > MAX_SHARING * file_bytes:
                 raise Refused("tensors that share their numbers many times over")
-            tensors[name] = _materialise(value, archive, root, order, buffers)
+            tensors[name] = _materialise(value, numbers, order)
     return tensors
 
 
@@ -128,205 +163,16 @@ def _member(archive: zipfile.ZipFile, name: str, at_most: int, *, optional: bool
     return archive.read(info)
 
 
-def _materialise(
-    tensor: StoredTensor, archive: zipfile.ZipFile, root: str, order: str, buffers: dict[str, bytes]
-) -> np.ndarray:
+def _materialise(tensor: StoredTensor, numbers: Callable[[Storage], bytes], order: str) -> np.ndarray:
     """The numbers of a tensor that has been checked."""
     storage, dtype = tensor.storage, np.dtype(order + tensor.storage.dtype)
     if math.prod(tensor.shape) == 0:
         return np.zeros(tensor.shape, dtype.newbyteorder("="))
-    size = storage.bytes
-    if storage.key not in buffers:
-        buffers[storage.key] = _member(archive, f"{root}data/{storage.key}", size)
+    content = numbers(storage)
     # Asked each time: the file may give one storage two sizes.
-    if len(buffers[storage.key]) != size:
-        raise Refused(f"storage {short(storage.key)} holds {len(buffers[storage.key])} bytes, not {short(size)}")
-    numbers = np.frombuffer(buffers[storage.key], dtype)
+    if len(content) != storage.bytes:
+        raise Refused(f"storage {short(storage.key)} holds {len(content)} bytes, not {short(storage.bytes)}")
+    values = np.frombuffer(content, dtype)
     strides = [step * dtype.itemsize for step in tensor.strides]
-    view = np.lib.stride_tricks.as_strided(numbers[tensor.offset :], tensor.shape, strides)
+    view = np.lib.stride_tricks.as_strided(values[tensor.offset :], tensor.shape, strides)
     return view.astype(dtype.newbyteorder("="))
-
-
-@dataclass(frozen=True)
-class _Global:
-    """A function or class that the file names."""
-
-    module: str
-    name: str
-
-    def __str__(self) -> str:
-        return f"{self.module}.{self.name}"
-
-
-@dataclass(frozen=True)
-class Storage:
-    """The numbers of one or more tensors, not read yet."""
-
-    key: str
-    dtype: str
-    count: int
-
-    @property
-    def bytes(self) -> int:
-        """The size that the file declares."""
-        return self.count * np.dtype(self.dtype).itemsize
-
-
-class Refused(Exception):
-    """The file holds something other than a dict of tensors."""
-
-
-@dataclass(frozen=True)
-class StoredTensor:
-    """A view of a storage, as the file describes it."""
-
-    storage: Storage
-    offset: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-
-    def check(self) -> int:
-        """The bytes it takes.
-
-        Raises:
-            Refused: it does not lie inside its storage.
-        """
-        whole = (*self.shape, *self.strides, self.offset)
-        if not all(isinstance(value, int) and value >= 0 for value in whole) or len(self.shape) != len(self.strides):
-            raise Refused("a tensor of impossible shape")
-        count = math.prod(self.shape)
-        last = self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.strides, strict=True))
-        if count and (last >= self.storage.count or count > self.storage.count):
-            raise Refused(f"a tensor of shape {short(list(self.shape))} in a storage of fewer numbers")
-        return count * np.dtype(self.storage.dtype).itemsize
-
-
-def short(value: object) -> str:
-    """At most 80 characters of a value of the file; only for text, numbers and lists of numbers."""
-    text = str(value)
-    return text if len(text) <= 80 else f"{text[:80]}..."
-
-
-def _call(function: object, arguments: object) -> object:
-    """The results of the few functions that describe tensors."""
-    if not isinstance(function, _Global) or not isinstance(arguments, tuple):
-        raise Refused("the file asks to call something that is no function")
-    name = str(function)
-    if name == "collections.OrderedDict" and not arguments:
-        return {}
-    if name == "torch._utils._rebuild_parameter" and arguments:
-        return arguments[0]
-    if name == "torch._utils._rebuild_tensor_v2" and len(arguments) >= 4:
-        storage, offset, shape, strides = arguments[:4]
-        if not isinstance(storage, Storage):
-            raise Refused("a tensor without a storage")
-        if not isinstance(shape, tuple) or not isinstance(strides, tuple) or len(shape) > MAX_AXES:
-            raise Refused("a tensor of impossible shape")
-        return StoredTensor(storage, offset, shape, strides)
-    raise Refused(f"the file asks to call {name} in another way than PyTorch does, which is refused")
-
-
-def _named(module: object, name: object) -> _Global:
-    if not isinstance(module, str) or not isinstance(name, str):
-        raise Refused("a name that is no text")
-    found = _Global(module, name)
-    if str(found) not in _FUNCTIONS and not (module == "torch" and name in _STORAGES):
-        raise Refused(f"the file asks for {short(found)}, which is refused")
-    return found
-
-
-def _storage(identity: object) -> Storage:
-    if not isinstance(identity, tuple) or len(identity) != 5 or identity[0] != "storage":
-        raise Refused("a reference that is no storage")
-    kind, key, count = identity[1], identity[2], identity[4]
-    if not isinstance(kind, _Global) or kind.name not in _STORAGES:
-        raise Refused("a reference that is no storage")
-    if not isinstance(key, str) or not isinstance(count, int) or count < 0:
-        raise Refused("a reference that is no storage")
-    return Storage(key, _STORAGES[kind.name], count)
-
-
-def interpret(program: bytes) -> object:
-    """Runs the description of a dict of tensors on a stack of plain values.
-
-    Raises:
-        Refused: it asks for anything else.
-    """
-    stack: list[Any] = []
-    memo: dict[int, object] = {}
-    for opcode, argument, _ in pickletools.genops(program):
-        name = opcode.name
-        if name == "STOP":
-            return stack.pop()
-        if name in _IGNORED:
-            continue
-        if name in _PUSHED:
-            stack.append(argument)
-        elif name in _MADE:
-            stack.append(_MADE[name]())
-        elif name in ("BINPUT", "LONG_BINPUT", "PUT"):
-            memo[int(argument)] = stack[-1]  # type: ignore[arg-type]
-        elif name == "MEMOIZE":
-            memo[len(memo)] = stack[-1]
-        elif name in ("BINGET", "LONG_BINGET", "GET"):
-            stack.append(memo[int(argument)])  # type: ignore[arg-type]
-        elif name == "GLOBAL":
-            stack.append(_named(*str(argument).split(" ", 1)))
-        elif name in _STACK_STEPS:
-            _STACK_STEPS[name](stack)
-        else:
-            raise Refused(f"the file uses the pickle instruction {name}, which is refused")
-    raise Refused("a description without an end")
-
-
-def _popped(stack: list, count: int) -> list:
-    values = stack[len(stack) - count :]
-    del stack[len(stack) - count :]
-    return values
-
-
-def _since_mark(stack: list) -> list:
-    values = _popped(stack, next(back for back, value in enumerate(reversed(stack)) if value is _MARK))
-    stack.pop()
-    return values
-
-
-def _set_items(stack: list, values: list) -> None:
-    if not all(isinstance(key, str | int | float) for key in values[::2]):
-        raise Refused("a dict whose keys are neither text nor numbers")
-    stack[-1].update(zip(values[::2], values[1::2], strict=True))
-
-
-def _extend(stack: list, values: list) -> None:
-    stack[-1].extend(values)
-
-
-_IGNORED = {"PROTO", "FRAME"}
-_PUSHED = {
-    *("BINUNICODE", "SHORT_BINUNICODE", "UNICODE", "BINUNICODE8", "SHORT_BINSTRING", "BINSTRING"),
-    *("BININT", "BININT1", "BININT2", "INT", "LONG", "LONG1", "BINFLOAT", "FLOAT"),
-}
-_MADE: dict[str, Callable[[], object]] = {
-    "MARK": lambda: _MARK,
-    "EMPTY_DICT": dict,
-    "EMPTY_LIST": list,
-    "EMPTY_TUPLE": tuple,
-    "NONE": lambda: None,
-    "NEWTRUE": lambda: True,
-    "NEWFALSE": lambda: False,
-}
-_STACK_STEPS: dict[str, Callable[[list], None]] = {
-    "SETITEM": lambda stack: _set_items(stack, _popped(stack, 2)),
-    "SETITEMS": lambda stack: _set_items(stack, _since_mark(stack)),
-    "APPEND": lambda stack: _extend(stack, _popped(stack, 1)),
-    "APPENDS": lambda stack: _extend(stack, _since_mark(stack)),
-    "TUPLE": lambda stack: stack.append(tuple(_since_mark(stack))),
-    "TUPLE1": lambda stack: stack.append(tuple(_popped(stack, 1))),
-    "TUPLE2": lambda stack: stack.append(tuple(_popped(stack, 2))),
-    "TUPLE3": lambda stack: stack.append(tuple(_popped(stack, 3))),
-    "REDUCE": lambda stack: stack.append(_call(*_popped(stack, 2))),
-    "BINPERSID": lambda stack: stack.append(_storage(stack.pop())),
-    "STACK_GLOBAL": lambda stack: stack.append(_named(*_popped(stack, 2))),
-    # The state of an OrderedDict is PyTorch's version notes, which are no tensors.
-    "BUILD": lambda stack: stack.pop(),
-}

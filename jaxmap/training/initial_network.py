@@ -116,7 +116,7 @@ def _architecture(
         )
     if init.holds == "network" and options.family is None:
         return replace(trained, classes=classes, **chosen)
-    family = options.family or ("tf" if trained.padding == "same" else "torch")
+    family = options.family or ("tf" if trained.size_remainder else "torch")
     stride = options.output_stride or trained.output_stride
     asked = replace(options, backbone=trained.backbone, family=family, output_stride=stride)
     kept = {name: getattr(trained, name) for name in _BACKBONE_FIELDS}

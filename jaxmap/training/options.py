@@ -177,6 +177,6 @@ class NetworkOptions:
     relief: bool | None = None
     """Whether the decoder also sees the relief of the ground, from disparity/NAME.png and cameras/NAME.json."""
     top_conv: bool | None = None
-    """Whether MobileNetV2 keeps its last convolution, to 1280 channels."""
+    """Whether MobileNetV2 or EfficientNet-Lite0 keeps its last convolution, to 1280 channels."""
     dropout: Share | None = None
     """Share of ASPP features dropped while training."""

@@ -50,8 +50,8 @@ def test_convolutions_are_the_library_s(padding):
     images = normal32(2, 8, 11, 4)
     cases = [
         (stride, dilation, size, depthwise)
-        for stride, dilation in ((1, 1), (2, 1), (1, 6))
-        for size in (1, 3)
+        for stride, dilation in ((1, 1), (2, 1), (1, 2), (1, 6))
+        for size in (1, 3, 5)
         for depthwise in (True, False)
     ]
     kernels = [normal32(size, size, 1 if depthwise else 4, 4) for _, _, size, depthwise in cases]
@@ -73,6 +73,7 @@ def test_convolutions_are_the_library_s(padding):
 def test_paddings_differ_at_stride_two_on_even_sizes():
     assert pad_amounts(8, 3, 2, 1, "same") == (0, 1)
     assert pad_amounts(8, 3, 2, 1, "torch") == (1, 1)
+    assert pad_amounts(8, 5, 2, 1, "same") == (1, 2)
     assert pad_amounts(9, 3, 2, 1, "same") == pad_amounts(9, 3, 2, 1, "torch") == (1, 1)
 
 

@@ -77,8 +77,12 @@ def test_the_network_of_a_key_is_always_the_same():
     assert not np.array_equal(one["backbone.stem.kernel"], other["backbone.stem.kernel"])
 
 
-QUICK_STRIDES = [(torch_architecture, 8, "mobilenet_v2"), (tf_architecture, 16, "mobilenet_v2")]
-ALL_STRIDES = [(*family, name) for family in ((torch_architecture, 8), (tf_architecture, 16)) for name in BACKBONES]
+QUICK_STRIDES = [(torch_architecture, 8, "mobilenet_v2"), (torch_architecture, 16, "efficientnet_lite0")]
+ALL_STRIDES = [
+    (*family, name)
+    for family in ((torch_architecture, 8), (torch_architecture, 16), (tf_architecture, 16))
+    for name in BACKBONES
+]
 
 
 @pytest.mark.parametrize(
@@ -106,11 +110,12 @@ def test_tensorflow_sizes_are_a_multiple_and_one():
     "make",
     [
         lambda: InvertedResidual(4, 4, 2, 1, 2, SMALL),
+        pytest.param(lambda: InvertedResidual(4, 6, 2, 2, 1, replace(SMALL, padding="same"), 5), marks=slow),
         lambda: ResidualUnit(4, 2, 2, (1, 2), replace(SMALL, padding="same"), bottleneck=True),
         pytest.param(lambda: XceptionUnit(4, (4, 4, 6), 2, 1, SMALL, shortcut="conv"), marks=slow),
         lambda: Aspp(4, replace(SMALL, atrous_rates=(2,), head_channels=4)),
     ],
-    ids=["inverted residual", "bottleneck", "xception", "aspp"],
+    ids=["inverted residual", "of 5x5", "bottleneck", "xception", "aspp"],
 )
 def test_gradients_equal_finite_differences(make):
     images = np.random.default_rng(0).normal(size=(1, 9, 8, 4))

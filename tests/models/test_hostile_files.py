@@ -22,7 +22,7 @@ from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import load_model, save_model
 from jaxmap.models.importers import import_weights
 from jaxmap.models.tensor_files import read_tensors
-from jaxmap.models.torch_files import read_torch_zip
+from jaxmap.models.torch_files import read_torch_file
 
 GOLDEN = Path(__file__).parent.parent / "golden"
 SMALL = replace(
@@ -149,7 +149,7 @@ def test_any_program_is_refused_or_gives_tensors(program, wrapped, tmp_path):
     body = b"".join(program)
     body = b"\x80\x02}" + word("w") + body + b"s." if wrapped else b"\x80\x02" + body + b"."
     with suppress(JaxmapError):
-        tensors = read_torch_zip(write_zip(tmp_path / "a.pth", body, {"0": bytes(16)}))
+        tensors = read_torch_file(write_zip(tmp_path / "a.pth", body, {"0": bytes(16)}))
         assert all(array.nbytes <= 16 for array in tensors.values())
 
 
@@ -186,9 +186,9 @@ def model_bytes(tmp_path_factory) -> bytes:
 
 
 @many
-@given(steps=damages())
-def test_a_damaged_torch_file_is_refused_or_read(steps, tmp_path):
-    (tmp_path / "a.pth").write_bytes(damaged((GOLDEN / "tiny.pth").read_bytes(), steps))
+@given(steps=damages(), name=st.sampled_from(["tiny.pth", "tiny_legacy.pth"]))
+def test_a_damaged_torch_file_is_refused_or_read(steps, name, tmp_path):
+    (tmp_path / "a.pth").write_bytes(damaged((GOLDEN / name).read_bytes(), steps))
     with suppress(JaxmapError):
         assert all(array.size <= 24 for array in read_tensors(tmp_path / "a.pth").values())
 

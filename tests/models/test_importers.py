@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from golden.seeded_weights import exported, seeded_weights
 from safetensors.numpy import save_file
+from torch_legacy import legacy_bytes
 
 from jaxmap.errors import JaxmapError
 from jaxmap.models import importers as tables
@@ -129,6 +130,41 @@ def test_timm_mobilenet(tmp_path):
     save_file(exported(architecture, list(tables.timm_mobilenet_v2()), tables.TORCH), tmp_path / "a.safetensors")
     imported = import_weights(tmp_path / "a.safetensors")
     assert "timm" in imported.source and same(imported.weights, architecture, "backbone")
+
+
+def efficientnet_names() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the published EfficientNet-Lite0, written from its design, not from our table."""
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def add(convolution: str, norm: str, *shape: int) -> None:
+        shapes[f"{convolution}.weight"] = shape
+        shapes.update({f"{norm}.{leaf}": shape[:1] for leaf in ("weight", "bias", "running_mean", "running_var")})
+        shapes[f"{norm}.num_batches_tracked"] = ()
+
+    add("_conv_stem", "_bn0", 32, 3, 3, 3)
+    before, unit = 32, 0
+    for after, units, size in (
+        *((16, 1, 3), (24, 2, 3), (40, 2, 5), (80, 3, 3), (112, 3, 5), (192, 4, 5), (320, 1, 3)),
+    ):
+        for _ in range(units):
+            block, wide = f"_blocks.{unit}", before * (6 if unit else 1)
+            if unit:
+                add(f"{block}._expand_conv", f"{block}._bn0", wide, before, 1, 1)
+            add(f"{block}._depthwise_conv", f"{block}._bn1", wide, 1, size, size)
+            add(f"{block}._project_conv", f"{block}._bn2", after, wide, 1, 1)
+            before, unit = after, unit + 1
+    add("_conv_head", "_bn1", 1280, 320, 1, 1)
+    return shapes | {"_fc.weight": (1000, 1280), "_fc.bias": (1000,)}
+
+
+def test_efficientnet_lite0_in_the_old_format_of_torch(tmp_path):
+    state = {name: np.full(shape, 0.5, np.float32) for name, shape in efficientnet_names().items()}
+    state["_fc.weight"] = np.zeros((4, 1280), np.float32)
+    state["_conv_stem.weight"][3, 2, 1, 0] = 7
+    (tmp_path / "a.pth").write_bytes(legacy_bytes(state))
+    imported = import_weights(tmp_path / "a.pth", classes=("sand", "rock"), output_stride=8)
+    assert imported.architecture == torch_architecture("efficientnet_lite0", ("sand", "rock"), output_stride=8)
+    assert imported.holds == "backbone" and imported.weights["backbone.stem.kernel"][1, 0, 2, 3] == 7
 
 
 @pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet18"])

@@ -1,4 +1,4 @@
-"""PyTorch's zip files are read without running anything that they hold."""
+"""PyTorch's files are read without running anything that they hold."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from torch_legacy import legacy_bytes
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models.torch_files import read_torch_zip
+from jaxmap.models.torch_files import read_torch_file
 
 GOLDEN = Path(__file__).parent.parent / "golden"
 
@@ -47,13 +48,14 @@ def tensor_program(
 
 def refusal(path: Path) -> str:
     with pytest.raises(JaxmapError) as caught:
-        read_torch_zip(path)
+        read_torch_file(path)
     assert str(path) in str(caught.value) and ";" in str(caught.value) and len(str(caught.value)) < 500
     return str(caught.value)
 
 
-def test_what_torch_writes_is_read():
-    tensors = read_torch_zip(GOLDEN / "tiny.pth")
+@pytest.mark.parametrize("name", ["tiny.pth", "tiny_legacy.pth"])
+def test_what_torch_writes_is_read(name):
+    tensors = read_torch_file(GOLDEN / name)
     base = np.arange(24, dtype=np.float32)
     assert set(tensors) == {"plain", "turned", "part", "half", "double", "parameter", "empty"}
     np.testing.assert_array_equal(tensors["plain"], base.reshape(2, 3, 4))
@@ -66,7 +68,7 @@ def test_what_torch_writes_is_read():
 
 def test_a_tensor_by_hand_is_read(tmp_path):
     path = write_zip(tmp_path / "a.pth", tensor_program((2, 3), (3, 1), 6), s0=np.arange(6, dtype="<f4").tobytes())
-    np.testing.assert_array_equal(read_torch_zip(path)["w"], np.arange(6.0).reshape(2, 3))
+    np.testing.assert_array_equal(read_torch_file(path)["w"], np.arange(6.0).reshape(2, 3))
 
 
 class Bomb:
@@ -79,8 +81,10 @@ class Bomb:
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_a_bomb_is_refused_by_name_and_does_not_go_off(tmp_path, protocol):
-    program = pickle.dumps({"state_dict": {"w": Bomb(tmp_path / "gone_off")}}, protocol=protocol)
-    assert "refused" in refusal(write_zip(tmp_path / "bomb.pth", program))
+    content = {"state_dict": {"w": Bomb(tmp_path / "gone_off")}}
+    assert "refused" in refusal(write_zip(tmp_path / "bomb.pth", pickle.dumps(content, protocol=protocol)))
+    assert "refused" in refusal(write(tmp_path / "old.pth", legacy_bytes({}, content=content)))
+    refusal(write(tmp_path / "alone.pth", pickle.dumps(content, protocol=protocol)))
     assert not (tmp_path / "gone_off").exists()
 
 
@@ -122,12 +126,53 @@ def test_compressed_members_are_refused(tmp_path):
     assert "compressed" in refusal(path)
 
 
-def test_the_old_format_says_how_to_convert():
-    assert "safetensors.torch.save_file" in refusal(GOLDEN / "tiny_legacy.pth")
+TWO = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asfortranarray(np.ones((2, 2), np.float32))}
 
 
-def test_a_truncated_file_is_an_error(tmp_path):
-    whole = (GOLDEN / "tiny.pth").read_bytes()
-    for length in (0, 10, len(whole) // 2, len(whole) - 1):
+def write(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def test_the_old_format_by_hand_is_read(tmp_path):
+    tensors = read_torch_file(write(tmp_path / "a.pth", legacy_bytes(TWO)))
+    assert set(tensors) == {"a", "b"}
+    for name, value in TWO.items():
+        np.testing.assert_array_equal(tensors[name], value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"magic": 7}, "no file of PyTorch's"),
+        ({"version": 1002}, "no file of PyTorch's"),
+        ({"keys": ["1000"]}, "a list of storages"),
+        ({"keys": ["1000", "1000"]}, "a list of storages"),
+        ({"keys": ["1000", "1001", "1002"]}, "a list of storages"),
+        ({"keys": ["1000", 1001]}, "a list of storages"),
+        ({"keys": {"1000": 0, "1001": 0}}, "a list of storages"),
+        ({"keys": ["1001", "1000"]}, "storage 1001 should hold 16 bytes"),
+        ({"counts": {"1000": 7}}, "storage 1000 should hold 24 bytes"),
+        ({"counts": {"1000": -1}}, "storage 1000 should hold 24 bytes"),
+        ({"content": Path("/")}, "refused"),
+    ],
+)
+def test_a_wrong_part_of_the_old_format_is_refused(changes, reason, tmp_path):
+    assert reason in refusal(write(tmp_path / "a.pth", legacy_bytes(TWO, **changes)))
+
+
+def test_storages_of_the_old_format_end_with_the_file(tmp_path):
+    whole = legacy_bytes(TWO)
+    refusal(write(tmp_path / "a.pth", whole + b"0"))
+    lying = whole.replace(b"K\x06", b"M\xff\xff").replace((6).to_bytes(8, "little"), (0xFFFF).to_bytes(8, "little"))
+    assert "storage 1000 should hold 262140 bytes" in refusal(write(tmp_path / "a.pth", lying))
+    half = whole.replace(b"1001", b"1000")
+    assert "storage 1000 has two sizes" in refusal(write(tmp_path / "a.pth", half))
+
+
+@pytest.mark.parametrize("name", ["tiny.pth", "tiny_legacy.pth"])
+def test_a_truncated_file_is_an_error(name, tmp_path):
+    whole = (GOLDEN / name).read_bytes()
+    for length in (0, 10, 15, 100, len(whole) // 2, len(whole) - 50, len(whole) - 1):
         (tmp_path / "cut.pth").write_bytes(whole[:length])
         refusal(tmp_path / "cut.pth")

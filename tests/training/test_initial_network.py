@@ -135,6 +135,11 @@ def test_the_family_decides_the_head_and_never_the_trained_backbone():
     start = start_of(saved(tf, holds="backbone"))
     assert start.architecture.padding == "same" and start.architecture.pool_first
     assert start.architecture.mean == tf.mean
+    # TensorFlow's padding alone does not make the head TensorFlow's.
+    lite = replace(torch_architecture("efficientnet_lite0", CLASSES), head_channels=8, low_level_channels=4)
+    start = start_of(saved(lite, holds="backbone"))
+    assert start.architecture.padding == "same" and not start.architecture.pool_first
+    assert start.architecture.mean == lite.mean
 
 
 @pytest.mark.parametrize(("stride", "rates"), [(16, (6, 12, 18)), (8, (12, 24, 36))])
