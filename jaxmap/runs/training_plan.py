@@ -249,7 +249,9 @@ def plan_image_training(
         batch_norms=network.batch_norms,
         negated=training_set.lookup.negated,
     )
-    data = ImageTrainingData(training_set, counts, ExampleReader(training_set.train, training_set.lookup, relief=relief))
+    data = ImageTrainingData(
+        training_set, counts, ExampleReader(training_set.train, training_set.lookup, relief=relief)
+    )
     return TrainingPlan(config, data, network, init, order, trainer)
 
 

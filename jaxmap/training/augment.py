@@ -135,7 +135,7 @@ def cut_relief(
 ) -> Float[Array, "rh rw R"]:
     """Cuts a window of an image of `size_px` out of its relief, unknown (0) outside; metres stay what they are.
 
-    Relief is at `RELIEF_STRIDE`: its pixel j lies over the pixels from `RELIEF_STRIDE j` on, of the crop as of the image.
+    Pixel j of relief lies over the pixels from `RELIEF_STRIDE j` on, of the crop as of the image.
     """
     coarse = CropWindow(window.scale, window.offset_px / RELIEF_STRIDE, window.mirrored)
     rows, columns = (-(-size // RELIEF_STRIDE) for size in crop_px)

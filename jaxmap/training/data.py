@@ -122,8 +122,7 @@ def with_stereo(training_set: TrainingSet) -> TrainingSet:
     def added(examples: tuple[Example, ...]) -> tuple[Example, ...]:
         there = (any(path.exists() for path in stereo_paths(folder, example.name)) for example in examples)
         return tuple(
-            example._replace(stereo=folder if found else None)
-            for example, found in zip(examples, there, strict=True)
+            example._replace(stereo=folder if found else None) for example, found in zip(examples, there, strict=True)
         )
 
     result = training_set._replace(train=added(training_set.train), validation=added(training_set.validation))
@@ -131,7 +130,7 @@ def with_stereo(training_set: TrainingSet) -> TrainingSet:
         raise JaxmapError(
             "no training image has a disparity, and the network sees relief",
             where=folder,
-            fix="put disparity/NAME.png and cameras/NAME.json beside images and masks, or say --network.no-relief",
+            fix="put disparity/NAME.png and cameras/NAME.json beside images and masks, or leave out --network.relief",
         )
     return result
 
