@@ -74,6 +74,7 @@ class Architecture:
         aspp_conv: whether a 3x3 convolution follows the ASPP.
         low_level_channels: channels the low-level feature is reduced to.
         decoder_convs: separable convolutions of the decoder.
+        relief_channels: channels of relief that the decoder sees beside the low-level feature; 0 for images alone.
         align_corners: whether bilinear resizing maps corner pixels onto corner pixels.
         dropout: share of ASPP features dropped while training.
         mean: input mean of R, G, B, on a scale of 0 to 1.
@@ -103,6 +104,7 @@ class Architecture:
     aspp_conv: bool = True
     low_level_channels: Channels = 48
     decoder_convs: Annotated[int, Interval(ge=1, le=16)] = 1
+    relief_channels: Annotated[int, Interval(ge=0, le=64)] = 0
     align_corners: bool = True
     dropout: Annotated[float, Interval(ge=0, lt=1)] = 0.5
     mean: tuple[float, float, float] = IMAGENET_MEAN
@@ -112,7 +114,7 @@ class Architecture:
     @classmethod
     def _check(cls, values: Any, handler: Callable[[Any], Architecture]) -> Architecture:
         try:
-            return handler(values)
+            record = handler(values)
         except ValidationError as error:
             clauses: dict[object, str] = {}
             for fault in error.errors():
@@ -122,6 +124,9 @@ class Architecture:
             # A file may have any number of fields of any length.
             faults = "; ".join(clause[:180] for clause in list(clauses.values())[:6])
             raise JaxmapError(faults, where="architecture", fix="correct the architecture") from error
+        if record.relief_channels and not record.decoder:
+            raise JaxmapError("relief without a decoder, which it joins", where="architecture", fix="set decoder")
+        return record
 
 
 _LITE: dict[str, Any] = {

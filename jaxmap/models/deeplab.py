@@ -13,6 +13,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, UInt8
 
+from jaxmap.errors import JaxmapError
 from jaxmap.models.architecture import Architecture, folded
 from jaxmap.models.backbones import (
     INVERTED_RESIDUAL_STAGES,
@@ -24,7 +25,7 @@ from jaxmap.models.backbones import (
 from jaxmap.models.convolutions import winograd_kernel
 from jaxmap.models.heads import Aspp, Decoder
 from jaxmap.models.layers import ConvBlock
-from jaxmap.models.resizing import resize_bilinear
+from jaxmap.models.resizing import resize_area, resize_bilinear
 from jaxmap.types import to_device
 
 Weights = dict[str, Array]
@@ -35,6 +36,12 @@ AnyArray = Array | np.ndarray
 
 Images = UInt8[Array, "B H W 3"] | Float[Array, "B H W 3"]
 """RGB, 0 to 255, of any size."""
+
+Relief = Float[Array, "B g v R"]
+"""Channels of relief over the field of view of the images, of any size; zeros where nothing is known."""
+
+LOW_LEVEL_STRIDE = 4
+"""Input pixels for each pixel of the decoder."""
 
 _BACKBONES: dict[str, Callable[[Architecture], InvertedResidualNet | ResNet | Xception65]] = {
     **dict.fromkeys(INVERTED_RESIDUAL_STAGES, InvertedResidualNet),
@@ -53,17 +60,26 @@ class DeepLab(nnx.Module):
         self.decoder = Decoder(self.backbone.low_level_channels, record) if record.decoder else None
         self.classifier = ConvBlock(record.head_channels, len(record.classes), norm="bias", activation="none")
 
-    def __call__(self, images: Images, *, dropout_key: PRNGKeyArray | None = None) -> Float[Array, "B H W C"]:
-        """Class logits at the size of the images."""
+    def __call__(
+        self, images: Images, relief: Relief | None = None, *, dropout_key: PRNGKeyArray | None = None
+    ) -> Float[Array, "B H W C"]:
+        """Class logits at the size of the images; see `coarse_logits`."""
         height, width = images.shape[1:3]
-        logits = self.coarse_logits(images, dropout_key=dropout_key)
+        logits = self.coarse_logits(images, relief, dropout_key=dropout_key)
         padded = (padded_size(height, self.record), padded_size(width, self.record))
         with jax.named_scope("upsample"):
             logits = resize_bilinear(logits, *padded, align_corners=self.record.align_corners)
         return logits[:, :height, :width]
 
-    def coarse_logits(self, images: Images, *, dropout_key: PRNGKeyArray | None = None) -> Float[Array, "B h w C"]:
-        """Class logits before the last upsampling, over the padded images: at stride 4, or the output stride."""
+    def coarse_logits(
+        self, images: Images, relief: Relief | None = None, *, dropout_key: PRNGKeyArray | None = None
+    ) -> Float[Array, "B h w C"]:
+        """Class logits before the last upsampling, over the padded images: at stride 4, or the output stride.
+
+        Raises:
+            JaxmapError: relief that is not what the network was made for; None is unknown relief to those that see it.
+        """
+        relief = placed_relief(relief, images.shape, self.record)
         with jax.named_scope("backbone"):
             features, low_level = self.backbone(normalise(images, self.record))
         with jax.named_scope("aspp"):
@@ -71,7 +87,7 @@ class DeepLab(nnx.Module):
         if self.decoder is None:
             return self.classifier(features)
         with jax.named_scope("decoder"):
-            return self.decoder(features, low_level, self.classifier)
+            return self.decoder(features, low_level, self.classifier, relief)
 
 
 def padded_size(size: int, record: Architecture) -> int:
@@ -88,6 +104,33 @@ def normalise(images: Images, record: Architecture) -> Float[Array, "B h w 3"]:
     scaled = (images.astype(dtype) - mean) / std
     after = [padded_size(size, record) - size for size in images.shape[1:3]]
     return jnp.pad(scaled, ((0, 0), (0, after[0]), (0, after[1]), (0, 0)))
+
+
+def placed_relief(relief: Relief | None, images: tuple[int, ...], record: Architecture) -> Array | None:
+    """Relief on the pixels of the decoder, padded as the images are; zeros where there is none.
+
+    Raises:
+        JaxmapError: the network sees none, or one of another shape.
+    """
+    channels, (batch, *size, _) = record.relief_channels, images
+    if relief is None:
+        if not channels:
+            return None
+        relief = jnp.zeros((batch, 1, 1, channels))
+    if relief.ndim != 4 or (relief.shape[0], relief.shape[3]) != (batch, channels) or not channels:
+        wanted = f"relief of {batch} images in {channels} channels" if channels else "no relief"
+        raise JaxmapError(
+            f"relief of shape {list(relief.shape)}, the network sees {wanted}",
+            where="relief",
+            fix="give what the network was trained on, or none",
+        )
+    inside = [-(-length // LOW_LEVEL_STRIDE) for length in size]
+    after = [
+        -(-padded_size(length, record) // LOW_LEVEL_STRIDE) - pixels
+        for length, pixels in zip(size, inside, strict=True)
+    ]
+    with jax.named_scope("relief"):
+        return jnp.pad(resize_area(relief, *inside), ((0, 0), (0, after[0]), (0, after[1]), (0, 0)))
 
 
 def make_network(architecture: Architecture, key: PRNGKeyArray) -> DeepLab:
@@ -131,14 +174,14 @@ class PureNetwork(NamedTuple):
     Attributes:
         architecture: the network.
         weights: its arrays by dotted path; a pytree.
-        apply: `(weights, images) -> logits`, not yet jitted.
+        apply: `(weights, images, relief=None) -> logits`, not yet jitted; see `DeepLab`.
         apply_coarse: the same for `DeepLab.coarse_logits`.
     """
 
     architecture: Architecture
     weights: Weights
-    apply: Callable[[Weights, Images], Float[Array, "B H W C"]]
-    apply_coarse: Callable[[Weights, Images], Float[Array, "B h w C"]]
+    apply: Callable[..., Float[Array, "B H W C"]]
+    apply_coarse: Callable[..., Float[Array, "B h w C"]]
 
 
 def pure_form(network: DeepLab) -> PureNetwork:
@@ -150,11 +193,11 @@ def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -
     """The pure form of a network with given weights, which must be complete."""
     skeleton = _skeleton(architecture)
 
-    def apply(weights: Weights, images: Images) -> Array:
-        return _filled(skeleton, weights)(images)
+    def apply(weights: Weights, images: Images, relief: Relief | None = None) -> Array:
+        return _filled(skeleton, weights)(images, relief)
 
-    def apply_coarse(weights: Weights, images: Images) -> Array:
-        return _filled(skeleton, weights).coarse_logits(images)
+    def apply_coarse(weights: Weights, images: Images, relief: Relief | None = None) -> Array:
+        return _filled(skeleton, weights).coarse_logits(images, relief)
 
     arrays = {name: value if isinstance(value, Array) else to_device(value) for name, value in weights.items()}
     return PureNetwork(architecture, arrays, apply, apply_coarse)
@@ -162,7 +205,7 @@ def pure_network(architecture: Architecture, weights: Mapping[str, ArrayLike]) -
 
 def training_form(
     architecture: Architecture, batch_norms: tuple[str, ...]
-) -> Callable[[Weights, Images, PRNGKeyArray], tuple[Float[Array, "B H W C"], Weights]]:
+) -> Callable[..., tuple[Float[Array, "B H W C"], Weights]]:
     """The network as it is trained: with dropout, and with batch norms that learn.
 
     Args:
@@ -171,12 +214,14 @@ def training_form(
             follow them; the others use the statistics they have.
 
     Returns:
-        `(weights, images, dropout_key) -> (logits, statistics)`: the running statistics after the batch, by
-        dotted path.
+        `(weights, images, dropout_key, relief=None) -> (logits, statistics)`: the running statistics after the
+        batch, by dotted path.
     """
     skeleton = _skeleton(architecture)
 
-    def apply(weights: Weights, images: Images, dropout_key: PRNGKeyArray) -> tuple[Array, Weights]:
+    def apply(
+        weights: Weights, images: Images, dropout_key: PRNGKeyArray, relief: Relief | None = None
+    ) -> tuple[Array, Weights]:
         network = _filled(skeleton, weights)
         learning = []
         for path, module in nnx.iter_modules(network):
@@ -184,7 +229,7 @@ def training_form(
             if isinstance(module, nnx.BatchNorm) and name.startswith(batch_norms):
                 module.use_running_average = False
                 learning += [f"{name}.mean", f"{name}.var"]
-        logits = network(images, dropout_key=dropout_key)
+        logits = network(images, relief, dropout_key=dropout_key)
         after = network_weights(network)
         return logits, {name: after[name] for name in learning}
 

@@ -20,6 +20,9 @@ from jaxmap.models.resizing import resize_bilinear, resize_taps
 PRODUCTS = 9
 """Coarse products that `separable_on_upsampled` makes with a 3x3 kernel, in the place of a fine one."""
 
+RELIEF_FEATURES = 32
+"""Channels that the decoder makes of relief."""
+
 BAND_BYTES = 1 << 20
 """What a band of rows may hold, so that it stays in the processor's cache."""
 
@@ -73,12 +76,31 @@ class Aspp(nnx.Module):
         return result if self.refine is None else self.refine(result)
 
 
+class ReliefBranch(nnx.Module):
+    """What the decoder makes of relief: two 3x3 convolutions, the second dilated, that see 7x7 pixels."""
+
+    def __init__(self, record: Architecture) -> None:
+        self.convs = nnx.List(
+            _plain(inputs, RELIEF_FEATURES, record, 3, dilation)
+            for inputs, dilation in ((record.relief_channels, 1), (RELIEF_FEATURES, 2))
+        )
+
+    def __call__(self, relief: Float[Array, "B H W R"]) -> Float[Array, "B H W C"]:
+        """Applies the branch."""
+        for block in self.convs:
+            relief = block(relief)
+        return relief
+
+
 class Decoder(nnx.Module):
-    """Joins the upsampled features with the low-level ones, at stride 4."""
+    """Joins the upsampled features with the low-level ones, and with those of relief, at stride 4."""
 
     def __init__(self, low_level_channels: int, record: Architecture) -> None:
         self.reduce = _plain(low_level_channels, record.low_level_channels, record)
         inputs = record.head_channels + record.low_level_channels
+        self.relief = ReliefBranch(record) if record.relief_channels else None
+        if self.relief is not None:
+            inputs += RELIEF_FEATURES
         self.refine = nnx.List(
             _separable(inputs if index == 0 else record.head_channels, record) for index in range(record.decoder_convs)
         )
@@ -91,9 +113,13 @@ class Decoder(nnx.Module):
         features: Float[Array, "B h w C"],
         low_level: Float[Array, "B H W L"],
         classifier: Callable[[Float[Array, "B b W C"]], Float[Array, "B b W K"]],
+        relief: Float[Array, "B H W R"] | None = None,
     ) -> Float[Array, "B H W K"]:
         """Applies the decoder, then the classifier, pixel by pixel; the result has the size of `low_level`."""
         low_level = self.reduce(low_level)
+        if self.relief is not None:
+            assert relief is not None
+            low_level = jnp.concatenate([low_level, self.relief(relief)], axis=-1)
         coarse, fine = features.shape[1:3], low_level.shape[1:3]
         if self.mergeable and PRODUCTS * coarse[0] * coarse[1] <= fine[0] * fine[1]:
             block = self.refine[0]

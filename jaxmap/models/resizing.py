@@ -42,6 +42,30 @@ def resize_taps(source: int, target: int, align_corners: bool) -> tuple[np.ndarr
     return low, np.minimum(low + 1, source - 1), (position - low).astype(np.float32)
 
 
+def resize_area(images: Float[Array, "B H W C"], height: int, width: int) -> Float[Array, "B h w C"]:
+    """Images of another size, edges onto edges: averaged where they shrink, interpolated where they grow."""
+    batch, rows, columns, channels = images.shape
+    if rows != height:
+        matrix = _area_matrix(rows, height)
+        images = jnp.matmul(matrix, images.reshape(batch, rows, -1), precision=PRECISION)
+        images = images.reshape(batch, height, columns, channels)
+    if columns != width:
+        matrix = _area_matrix(columns, width)
+        images = jnp.matmul(matrix, images, precision=PRECISION)
+    return images
+
+
+@cache
+def _area_matrix(source: int, target: int) -> Float[np.ndarray, "target source"]:
+    """The share of each source pixel in each target pixel along an axis."""
+    if source < target:
+        return resize_rows(np.eye(source), target, align_corners=False).astype(np.float32)
+    edges = np.arange(target + 1) * (source / target)
+    pixels = np.arange(source)
+    covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
+    return (covered.clip(0) * (target / source)).astype(np.float32)
+
+
 @partial(jax.custom_vjp, nondiff_argnums=(1, 2, 3))
 def _resize_axis(images: Array, target: int, axis: int, align_corners: bool) -> Array:
     source = images.shape[axis]

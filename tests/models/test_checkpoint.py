@@ -80,6 +80,11 @@ def test_the_record_is_plain_json(path):
     assert record["architecture"]["padding"] == "torch"
 
 
+def test_files_from_before_relief_see_none(path):
+    with_record(path, lambda record: record["architecture"].pop("relief_channels"))
+    assert load_model(path).architecture == SMALL
+
+
 def test_a_backbone_alone_is_no_network(tmp_path, weights):
     backbone = {name: value for name, value in weights.items() if name.startswith("backbone.")}
     save_model(tmp_path / "b.safetensors", SMALL, backbone, holds="backbone")
@@ -152,6 +157,8 @@ def test_a_wrong_type_is_refused(path, weights):
         lambda record: record["architecture"].update(head_channels=10**9),
         lambda record: record["architecture"].update(head_channels="many"),
         lambda record: record["architecture"].update(output_stride=3),
+        lambda record: record["architecture"].update(relief_channels=65),
+        lambda record: record["architecture"].update(relief_channels=6, decoder=False),
         lambda record: record["normalisation"].update(std=[0, 0, 0]),
     ],
 )

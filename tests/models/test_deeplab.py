@@ -32,7 +32,9 @@ from jaxmap.models.deeplab import (
     make_network,
     network_weights,
     padded_size,
+    placed_relief,
     pure_network,
+    training_form,
     weight_shapes,
 )
 from jaxmap.models.heads import Aspp, Decoder
@@ -43,10 +45,11 @@ slow = pytest.mark.slow
 
 
 @pytest.mark.slow
-def test_a_small_network_keeps_the_laws():
-    """Size, padding, batch, folding, the same bits twice, one compilation."""
+@pytest.mark.parametrize("relief_channels", [0, 2])
+def test_a_small_network_keeps_the_laws(relief_channels):
+    """Size, padding, batch, folding, the same bits twice, one compilation; no relief is relief of zeros."""
     # Of all backbones it compiles fastest.
-    record = replace(SMALL, backbone="resnet18", atrous_rates=(2,))
+    record = replace(SMALL, backbone="resnet18", atrous_rates=(2,), relief_channels=relief_channels)
     weights, image, traced = seeded_weights(record), seeded_image(45, 61)[None], []
     apply = pure_network(record, weights).apply
     compiled = jax.jit(lambda weights, images: (traced.append(images.shape), apply(weights, images))[1])
@@ -64,6 +67,50 @@ def test_a_small_network_keeps_the_laws():
     fast = inference_network(record, weights)
     assert sum(kernel.shape[:2] == (4, 4) for kernel in fast.weights.values()) == 10
     np.testing.assert_allclose(jax.jit(fast.apply)(fast.weights, image), logits, atol=1e-4)
+    if relief_channels:
+        zeros, other = (np.full((1, 24, 30, relief_channels), value, np.float32) for value in (0, 0.5))
+        np.testing.assert_array_equal(jax.jit(apply)(weights, image, zeros), logits)
+        assert np.abs(jax.jit(fast.apply)(fast.weights, image, other) - logits).max() > 1e-3
+        trained = training_form(replace(record, dropout=0.0), ())
+        key = jax.random.key(0)
+        np.testing.assert_allclose(jax.jit(trained)(weights, image, key, zeros)[0], logits, atol=1e-4)
+
+
+SEEING = replace(SMALL, relief_channels=2)
+
+
+def test_relief_lies_on_the_pixels_of_the_decoder():
+    images = (3, 45, 61, 3)
+    assert placed_relief(None, images, SMALL) is None
+    np.testing.assert_array_equal(placed_relief(None, images, SEEING), np.zeros((3, 12, 16, 2)))
+    ramp = jnp.broadcast_to(jnp.arange(24.0)[:, None, None], (3, 24, 32, 2))
+    placed = np.asarray(placed_relief(ramp, (3, 45, 50, 3), SEEING))
+    np.testing.assert_allclose(
+        placed[..., :13, :], np.broadcast_to(2 * np.arange(12)[:, None, None] + 0.5, (3, 12, 13, 2))
+    )
+    np.testing.assert_array_equal(placed[..., 13:, :], np.zeros((3, 12, 3, 2)))
+    # The original's sizes are a multiple of the stride and one.
+    odd = replace(tf_architecture("mobilenet_v2", CLASSES), relief_channels=2)
+    assert np.asarray(placed_relief(ramp, (3, 500, 513, 3), odd)).shape == (3, 129, 129, 2)
+
+
+@pytest.mark.parametrize(
+    ("record", "shape", "reason"),
+    [
+        (SMALL, (1, 4, 4, 2), r"relief of shape \[1, 4, 4, 2\], the network sees no relief"),
+        (SEEING, (1, 4, 4, 3), "the network sees relief of 1 images in 2 channels"),
+        (SEEING, (2, 4, 4, 2), "the network sees relief of 1 images in 2 channels"),
+        (SEEING, (4, 4, 2), "the network sees relief of 1 images in 2 channels"),
+    ],
+)
+def test_relief_that_the_network_does_not_know_is_refused(record, shape, reason):
+    with pytest.raises(JaxmapError, match=reason):
+        placed_relief(jnp.zeros(shape), (1, 16, 16, 3), record)
+
+
+def test_relief_needs_a_decoder():
+    with pytest.raises(JaxmapError, match="relief without a decoder"):
+        replace(SEEING, decoder=False)
 
 
 def test_the_network_of_a_key_is_always_the_same():

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
+from golden.seeded_weights import seeded_weights
 from hypothesis import given
 from hypothesis import strategies as st
+from jaxtyping import ArrayLike
 
 from jaxmap.models import heads
-from jaxmap.models.architecture import folded, torch_architecture
-from jaxmap.models.heads import Decoder, by_bands, rows_per_band, separable_on_upsampled
+from jaxmap.models.architecture import Architecture, torch_architecture
+from jaxmap.models.deeplab import fold_batch_norm, weight_shapes
+from jaxmap.models.heads import RELIEF_FEATURES, Decoder, by_bands, rows_per_band, separable_on_upsampled
 
 
 def normal(seed: int, *shape: int) -> np.ndarray:
@@ -78,24 +83,55 @@ def test_bands_fill_the_rows_and_keep_to_the_limit(rows, row_bytes, limit):
     assert band == 1 or band * row_bytes <= limit
 
 
+RECORD = replace(torch_architecture("resnet18", ["sand", "rock"]), head_channels=8, low_level_channels=4)
+SEEING = replace(RECORD, relief_channels=3)
+
+
+def filled(record: Architecture, weights: Mapping[str, ArrayLike]) -> Decoder:
+    """A decoder with its part of the weights of a network."""
+    decoder = Decoder(64, record)
+    for path, variable in nnx.to_flat_state(nnx.state(decoder)):
+        variable.set_value(jnp.asarray(weights[".".join(map(str, ("decoder", *path)))]))
+    return decoder
+
+
 def test_the_decoder_uses_it_where_it_spares_products(monkeypatch):
-    record = replace(torch_architecture("mobilenet_v2", ["sand", "rock"]), head_channels=8, low_level_channels=4)
-    assert not Decoder(4, record).mergeable, "batch norms that may learn need all pixels at once"
-    fast, plain, calls = Decoder(4, folded(record)), Decoder(4, folded(record)), []
+    assert not Decoder(64, SEEING).mergeable, "batch norms that may learn need all pixels at once"
+    weights, calls = seeded_weights(SEEING), []
+    record, fewer = fold_batch_norm(SEEING, weights)
+    fast, plain, unfolded = filled(record, fewer), filled(record, fewer), filled(SEEING, weights)
     plain.mergeable = False
-    for decoder in (fast, plain):
-        for number, block in enumerate((decoder.reduce, decoder.refine[0].depthwise, decoder.refine[0].pointwise)):
-            block.kernel[...] = normal(number, *block.kernel.shape)
 
     def counted(*arguments, **options):
         calls.append(True)
         return separable_on_upsampled(*arguments, **options)
 
     monkeypatch.setattr(heads, "separable_on_upsampled", counted)
-    fine = normal(8, 1, 8, 12, 4)
-    jax.eval_shape(lambda *features: fast(*features, jnp.tanh), normal(7, 1, 4, 6, 8), fine)
+    fine, relief = normal(8, 1, 8, 12, 64), jnp.asarray(normal(9, 1, 8, 12, 3))
+    jax.eval_shape(lambda coarse, fine: fast(coarse, fine, jnp.tanh, relief), normal(7, 1, 4, 6, 8), fine)
     assert not calls
-    both = jax.jit(lambda *features: (fast(*features, jnp.tanh), plain(*features, jnp.tanh)))
-    result, expected = both(normal(7, 1, 2, 3, 8), fine)
+
+    @jax.jit
+    def all_three(coarse, fine, relief):
+        return [decoder(coarse, fine, jnp.tanh, relief) for decoder in (fast, plain, unfolded)]
+
+    coarse = normal(7, 1, 2, 3, 8)
+    result, expected, before = all_three(coarse, fine, relief)
     assert len(calls) == 1
     np.testing.assert_allclose(result, expected, atol=1e-4)
+    np.testing.assert_allclose(before, expected, atol=1e-4)
+    # What it sees matters, two pixels and their neighbours away, and no further.
+    moved = np.abs(all_three(coarse, fine, relief + (np.arange(12) == 0)[:, None])[0] - result).max(axis=(0, 1, 3))
+    assert (moved[:5] > 1e-5).all() and (moved[5:] < 1e-6).all()
+
+
+def test_relief_adds_a_branch_and_widens_the_convolution_that_joins_it():
+    without, seeing = weight_shapes(RECORD), weight_shapes(SEEING)
+    assert set(seeing) - set(without) == {
+        f"decoder.relief.convs.{index}.{leaf}"
+        for index in (0, 1)
+        for leaf in ("kernel", "norm.scale", "norm.bias", "norm.mean", "norm.var")
+    }
+    changed = {name for name in without if without[name] != seeing[name]}
+    assert changed == {"decoder.refine.0.depthwise.kernel", "decoder.refine.0.pointwise.kernel"}
+    assert seeing["decoder.refine.0.pointwise.kernel"][2] == 8 + 4 + RELIEF_FEATURES

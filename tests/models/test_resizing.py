@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxmap.models.resizing import resize_bilinear, resize_rows
+from jaxmap.models.resizing import resize_area, resize_bilinear, resize_rows
 
 
 @pytest.mark.parametrize("align_corners", [True, False])
@@ -52,3 +52,22 @@ def test_resizing_is_its_matrices_and_its_gradient_their_transposes(before, afte
         resized, gradient = both(images, back)
     np.testing.assert_allclose(resized, np.einsum("vr,uc,brcn->bvun", rows, columns, images), atol=1e-6)
     np.testing.assert_allclose(gradient, np.einsum("vr,uc,bvun->brcn", rows, columns, back), atol=1e-6)
+
+
+@given(
+    before=st.tuples(st.integers(1, 12), st.integers(1, 12)), after=st.tuples(st.integers(1, 12), st.integers(1, 12))
+)
+@settings(max_examples=5)
+@example(before=(8, 6), after=(4, 2))
+@example(before=(5, 2), after=(3, 4))
+def test_shrinking_averages_and_growing_interpolates(before, after):
+    images = np.random.default_rng(0).normal(size=(2, *before, 3)).astype(np.float32)
+    expected = images
+    for axis, (old, new) in enumerate(zip(before, after, strict=True), start=1):
+        if old <= new:
+            matrix = resize_rows(np.eye(old), new, align_corners=False)
+        else:
+            # Each pixel is cut into as many pieces as there are new ones, and old pieces make a new pixel.
+            matrix = np.repeat(np.eye(old), new, axis=0).reshape(new, old, old).mean(axis=1)
+        expected = np.moveaxis(np.tensordot(matrix, expected, (1, axis)), 0, axis)
+    np.testing.assert_allclose(resize_area(jnp.asarray(images), *after), expected, atol=1e-5)
