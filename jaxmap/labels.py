@@ -9,6 +9,9 @@ import numpy as np
 IGNORE = 255
 """Label of a pixel or voxel that carries no class."""
 
+ANY_OTHER = 254
+"""Label of a pixel of a training mask that is of any class but one, which the masks negate ("not rock")."""
+
 ROVER_CLASSES: tuple[str, ...] = ("background", "sand", "rock")
 """The paper's three classes, in the order of the label PNGs (0, 1, 2)."""
 

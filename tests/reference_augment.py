@@ -42,6 +42,28 @@ def cut(
     return colours, near
 
 
+def cut_relief(
+    scale: float,
+    offset_px: tuple[int, int],
+    mirrored: bool,
+    relief: np.ndarray,
+    size_px: tuple[int, int],
+    crop_px: tuple[int, int],
+) -> np.ndarray:
+    """The twin of `jaxmap.training.augment.cut_relief`: where the middle of each block of 4 x 4 pixels lies."""
+    shape = -(-crop_px[0] // 4), -(-crop_px[1] // 4)
+    held = -(-size_px[0] // 4), -(-size_px[1] // 4)
+    result = np.zeros((*shape, relief.shape[-1]))
+    for row, column in np.ndindex(*shape):
+        y, x = ((4 * place + 2 + start) / scale for place, start in zip((row, column), offset_px, strict=True))
+        x = size_px[1] - x if mirrored else x
+        # From pixels of the image, counted from its edge, to pixels of relief, counted from their middles.
+        y, x = y / 4 - 0.5, x / 4 - 0.5
+        if 0 <= np.floor(y + 0.5) < size_px[0] / 4 and 0 <= np.floor(x + 0.5) < size_px[1] / 4:
+            result[row, column] = bilinear(relief, y, x, held)
+    return result
+
+
 def bilinear(image: np.ndarray, y: float, x: float, size_px: tuple[int, int]) -> np.ndarray:
     """The colour between the four pixels around a place, which is moved onto the image first."""
     y, x = min(max(y, 0), size_px[0] - 1), min(max(x, 0), size_px[1] - 1)

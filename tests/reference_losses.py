@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxmap.labels import IGNORE
+from jaxmap.labels import ANY_OTHER, IGNORE
 
 
 def softmax(logits: np.ndarray) -> np.ndarray:
@@ -12,24 +12,31 @@ def softmax(logits: np.ndarray) -> np.ndarray:
     return raised / raised.sum(axis=-1, keepdims=True)
 
 
-def cross_entropy(logits: np.ndarray, labels: np.ndarray, class_weights: np.ndarray, smoothing: float) -> float:
+def cross_entropy(
+    logits: np.ndarray, labels: np.ndarray, class_weights: np.ndarray, smoothing: float, negated: int
+) -> float:
     """Weighted mean over the labelled pixels of the cross-entropy with a smoothed truth."""
     total = weight = 0.0
     for values, label in zip(softmax(logits), labels, strict=True):
         if label == IGNORE:
             continue
-        target = np.full(len(values), smoothing / len(values))
-        target[label] += 1 - smoothing
-        total -= class_weights[label] * (target * np.log(values)).sum()
-        weight += class_weights[label]
+        possible = [index for index in range(len(values)) if index != negated] if label == ANY_OTHER else [label]
+        likelihood = (1 - smoothing) * np.log(values[possible].sum()) + smoothing * np.log(values).mean()
+        total -= class_weights[possible].mean() * likelihood
+        weight += class_weights[possible].mean()
     return total / weight if weight else 0.0
 
 
-def soft_iou_loss(logits: np.ndarray, labels: np.ndarray) -> float:
+def known_of(labels: np.ndarray, index: int, negated: int) -> np.ndarray:
+    """Where it is known whether a pixel is of a class."""
+    return (labels != IGNORE) & ((labels != ANY_OTHER) | (index == negated))
+
+
+def soft_iou_loss(logits: np.ndarray, labels: np.ndarray, negated: int) -> float:
     """One minus intersection over union of probabilities; mean over the classes that the labels hold."""
-    known = labels != IGNORE
     losses = []
     for index in range(logits.shape[1]):
+        known = known_of(labels, index, negated)
         truth, share = labels[known] == index, softmax(logits)[known, index]
         if truth.any():
             intersection = (share * truth).sum()
@@ -43,11 +50,11 @@ def jaccard_loss(missed: np.ndarray, truth: np.ndarray) -> float:
     return 1 - (predicted & truth).sum() / (predicted | truth).sum()
 
 
-def lovasz_loss(logits: np.ndarray, labels: np.ndarray) -> float:
+def lovasz_loss(logits: np.ndarray, labels: np.ndarray, negated: int) -> float:
     """The Lovasz extension as its definition has it: a sum over the sets of the largest errors."""
-    known = labels != IGNORE
     losses = []
     for index in range(logits.shape[1]):
+        known = known_of(labels, index, negated)
         truth = labels[known] == index
         if not truth.any():
             continue

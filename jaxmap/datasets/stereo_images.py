@@ -1,6 +1,7 @@
 """The stereo side of training images: `disparity/NAME.png` and `cameras/NAME.json` beside `images/` and `masks/`.
 
-Disparity is coded as KITTI's benchmark does: 16-bit, 1/256 px, 0 where unknown, on the pixels of the rectified left image.
+Disparity is coded as KITTI's benchmark does: 16-bit, 1/256 px, 0 where unknown, on the pixels of the rectified left
+image.
 """
 
 from __future__ import annotations
@@ -43,6 +44,11 @@ class LevelCamera:
 _CAMERA = TypeAdapter(LevelCamera)
 
 
+def stereo_paths(folder: Path, name: str) -> tuple[Path, Path]:
+    """The files of disparity and camera of an image, which may have none."""
+    return folder / "disparity" / f"{name}.png", folder / "cameras" / f"{name}.json"
+
+
 def write_stereo(folder: Path, name: str, disparity_px: Float32[np.ndarray, "H W"], camera: LevelCamera) -> None:
     """Writes disparity and camera of an image.
 
@@ -55,9 +61,10 @@ def write_stereo(folder: Path, name: str, disparity_px: Float32[np.ndarray, "H W
     done, content = cv2.imencode(".png", coded)
     if not done:
         raise JaxmapError("the disparity cannot be encoded", where=name)
-    with atomic_path(folder / "disparity" / f"{name}.png") as temporary:
+    disparity, level_camera = stereo_paths(folder, name)
+    with atomic_path(disparity) as temporary:
         temporary.write_bytes(content.tobytes())
-    with atomic_path(folder / "cameras" / f"{name}.json") as temporary:
+    with atomic_path(level_camera) as temporary:
         temporary.write_text(json.dumps(asdict(camera)) + "\n", encoding="utf8")
 
 
@@ -67,7 +74,7 @@ def read_stereo(folder: Path, name: str) -> tuple[Float32[np.ndarray, "H W"], Le
     Raises:
         JaxmapError: a file cannot be read, or one is there without the other.
     """
-    disparity, camera = folder / "disparity" / f"{name}.png", folder / "cameras" / f"{name}.json"
+    disparity, camera = stereo_paths(folder, name)
     if not disparity.exists() and not camera.exists():
         return None
     for path in (disparity, camera):

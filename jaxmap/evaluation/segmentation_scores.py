@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jaxmap.errors import JaxmapError
-from jaxmap.labels import IGNORE
+from jaxmap.labels import ANY_OTHER, IGNORE
 
 CALIBRATION_BINS = 15
 
@@ -23,19 +23,25 @@ class SegmentationScores:
         classes: names in the order of the labels.
         confusion: pixels by true class (rows) and predicted class (columns).
         calibration: pixels, summed confidence and correct pixels for each bin of confidence.
+        negated: the class that pixels labelled `ANY_OTHER` are not of; None where masks hold no such pixels.
+        denied: of such pixels, those predicted to be of another class, and to be of that one. They count in the
+            accuracy, and in the scores of the negated class; of the other classes nothing is known there.
         images: how many images were counted.
     """
 
     classes: tuple[str, ...]
     confusion: Int[np.ndarray, "C C"]
     calibration: Float[np.ndarray, "B 3"]
+    negated: int | None
+    denied: Int[np.ndarray, "2"]
     images: int = 0
 
     @classmethod
-    def empty(cls, classes: Sequence[str]) -> SegmentationScores:
+    def empty(cls, classes: Sequence[str], negated: int | None = None) -> SegmentationScores:
         """Scores of nothing yet."""
         count = len(classes)
-        return cls(tuple(classes), np.zeros((count, count), np.int64), np.zeros((CALIBRATION_BINS, 3)))
+        confusion, calibration = np.zeros((count, count), np.int64), np.zeros((CALIBRATION_BINS, 3))
+        return cls(tuple(classes), confusion, calibration, negated, np.zeros(2, np.int64))
 
     def add(
         self,
@@ -48,6 +54,10 @@ class SegmentationScores:
         Raises:
             JaxmapError: the mask has another size than the logits, or labels that are no class.
         """
+        if self.negated is not None:
+            other = truth == ANY_OTHER
+            self.denied += np.bincount(logits[other].argmax(axis=-1) == self.negated, minlength=2)
+            truth = np.where(other, np.uint8(IGNORE), truth)
         check_mask(truth, logits.shape[:2], len(self.classes), where)
         known = truth != IGNORE
         labels, predicted = truth[known].astype(np.int64), logits[known].argmax(axis=-1)
@@ -68,10 +78,12 @@ class SegmentationScores:
         """
         hits = np.diagonal(self.confusion)
         true, predicted, total = self.confusion.sum(axis=1), self.confusion.sum(axis=0), self.confusion.sum()
+        if self.negated is not None:
+            predicted[self.negated] += self.denied[1]
         ious = [_quotient(hits[index], true[index] + predicted[index] - hits[index]) for index in range(len(hits))]
         known = [iou for iou in ious if iou is not None]
         return {
-            "accuracy": _quotient(hits.sum(), total),
+            "accuracy": _quotient(hits.sum() + self.denied[0], total + self.denied.sum()),
             "mean_iou": float(np.mean(known)) if known else None,
             "classes": {
                 name: {
@@ -86,7 +98,7 @@ class SegmentationScores:
             "calibration": self.calibration.tolist(),
             "ece": _quotient(abs(self.calibration[:, 1] - self.calibration[:, 2]).sum(), total),
             "images": self.images,
-            "pixels": int(total),
+            "pixels": int(total + self.denied.sum()),
         }
 
 

@@ -20,7 +20,7 @@ from jaxmap.models.checkpoint import load_model
 from jaxmap.models.deeplab import Weights
 from jaxmap.runs.config import LabellerName, MapConfig
 from jaxmap.training.batches import ExampleOrder, ExampleReader, batches_from
-from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set
+from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set, with_stereo
 from jaxmap.training.initial_network import InitialNetwork, make_initial_network
 from jaxmap.training.losses import class_weights
 from jaxmap.training.options import DataOptions, NetworkOptions, TrainingOptions
@@ -197,10 +197,13 @@ class ImageTrainingData:
         }
 
     def facts(self) -> dict[str, str]:
-        """Numbers of images."""
+        """Numbers of images, and of those with relief."""
+        parts = {"Training images": self.training_set.train, "Validation images": self.training_set.validation}
         return {
-            "Training images": str(len(self.training_set.train)),
-            "Validation images": str(len(self.training_set.validation)),
+            name: f"{len(part)}, {found} with relief"
+            if (found := sum(example.stereo is not None for example in part))
+            else str(len(part))
+            for name, part in parts.items()
         }
 
 
@@ -225,14 +228,17 @@ def plan_image_training(
     training_set = open_training_set(folder, config.classes, config.data, seed=config.seed)
     for note in training_set.notes:
         notify(f"note: {note}")
+    saved, where = (None, "network") if init is None else (load_model(init), init)
+    network = make_initial_network(config.network, config.norm, config.classes, saved, seed=config.seed, where=where)
+    relief = network.architecture.relief_channels > 0
+    if relief:
+        training_set = with_stereo(training_set)
     counts = check_training_set(training_set)
     shares = zip(config.classes, counts[0] / counts[0].sum(), strict=True)
     notify(
         f"{len(training_set.train)} images to train on, {len(training_set.validation)} to validate; training pixels: "
         + ", ".join(f"{name} {share:.1%}" for name, share in shares)
     )
-    saved, where = (None, "network") if init is None else (load_model(init), init)
-    network = make_initial_network(config.network, config.norm, config.classes, saved, seed=config.seed, where=where)
     notify(describe_network(network))
     order = ExampleOrder.of(len(training_set.train), config)
     trainer = make_trainer(
@@ -241,8 +247,11 @@ def plan_image_training(
         steps=order.steps,
         class_weights=jnp.asarray(class_weights(config.loss, counts[0])),
         batch_norms=network.batch_norms,
+        negated=training_set.lookup.negated,
     )
-    data = ImageTrainingData(training_set, counts, ExampleReader(training_set.train, training_set.lookup))
+    data = ImageTrainingData(
+        training_set, counts, ExampleReader(training_set.train, training_set.lookup, relief=relief)
+    )
     return TrainingPlan(config, data, network, init, order, trainer)
 
 

@@ -1,4 +1,4 @@
-"""Augmentation: scaled, mirrored crops of images and masks, and photometric changes, in one compiled function.
+"""Augmentation: scaled, mirrored crops of images, masks and relief, and changes of light, in one compiled function.
 
 A crop is drawn as a `CropWindow`, which maps every pixel of the crop to a place on the image. Colours are interpolated
 bilinearly; labels are those of the nearest pixel, so that no new label arises.
@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped, UInt8
 
+from jaxmap.geometry.relief import RELIEF_STRIDE
 from jaxmap.labels import IGNORE
 from jaxmap.training.options import AugmentationOptions
 
@@ -31,6 +32,14 @@ class CropWindow(NamedTuple):
     scale: Float[Array, ""]
     offset_px: Int[Array, "2"]
     mirrored: Bool[Array, ""]
+
+
+class Crop(NamedTuple):
+    """A training example: an image of 0 to 255, its labels, and its relief, where the network sees any."""
+
+    image: Float[Array, "h w 3"]
+    labels: UInt8[Array, "h w"]
+    relief: Float[Array, "rh rw R"] | None = None
 
 
 def draw_window(
@@ -108,13 +117,8 @@ def cut(
     Returns:
         The crop, 0 to 255, and its labels.
     """
-    rows, columns = (_positions(window, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
-    inside = rows.inside[:, None] & columns.inside[None, :]
-    values = image.astype(jnp.float32)
-    values = _between(values[rows.low], values[rows.high], rows.share[:, None, None])
-    values = _between(values[:, columns.low], values[:, columns.high], columns.share[None, :, None])
     near = cut_nearest(window, labels, size_px, crop_px, IGNORE)
-    return jnp.where(inside[..., None], values, jnp.array(fill)), near
+    return _cut_linear(window, image, size_px, crop_px, jnp.array(fill)), near
 
 
 def cut_nearest(
@@ -124,6 +128,28 @@ def cut_nearest(
     rows, columns = (_positions(window, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
     inside = rows.inside[:, None] & columns.inside[None, :]
     return jnp.where(inside, values[rows.nearest][:, columns.nearest], outside).astype(values.dtype)
+
+
+def cut_relief(
+    window: CropWindow, relief: Float[Array, "h w R"], size_px: Int[Array, "2"], crop_px: tuple[int, int]
+) -> Float[Array, "rh rw R"]:
+    """Cuts a window of an image of `size_px` out of its relief, unknown (0) outside; metres stay what they are.
+
+    Pixel j of relief lies over the pixels from `RELIEF_STRIDE j` on, of the crop as of the image.
+    """
+    coarse = CropWindow(window.scale, window.offset_px / RELIEF_STRIDE, window.mirrored)
+    rows, columns = (-(-size // RELIEF_STRIDE) for size in crop_px)
+    return _cut_linear(coarse, relief, size_px / RELIEF_STRIDE, (rows, columns), jnp.zeros(()))
+
+
+def _cut_linear(window: CropWindow, values: Array, size_px: Array, crop_px: tuple[int, int], outside: Array) -> Array:
+    """Cuts a window out of an image of vectors, interpolating bilinearly; what lies beyond is `outside`."""
+    rows, columns = (_positions(window, axis, size_px[axis], crop_px[axis]) for axis in (0, 1))
+    inside = rows.inside[:, None] & columns.inside[None, :]
+    values = values.astype(jnp.float32)
+    values = _between(values[rows.low], values[rows.high], rows.share[:, None, None])
+    values = _between(values[:, columns.low], values[:, columns.high], columns.share[None, :, None])
+    return jnp.where(inside[..., None], values, outside)
 
 
 class _Positions(NamedTuple):
@@ -142,9 +168,11 @@ def _positions(window: CropWindow, axis: int, size: Array, count: int) -> _Posit
         exact = jnp.where(window.mirrored, size - 1 - exact, exact)
     nearest = jnp.floor(exact + 0.5).astype(jnp.int32)
     inside = (nearest >= 0) & (nearest < size)
-    exact = jnp.clip(exact, 0, size - 1)
+    # Of relief, the last pixel may lie over less than a whole one.
+    last = jnp.ceil(size).astype(jnp.int32) - 1
+    exact = jnp.clip(exact, 0, last)
     low = jnp.floor(exact).astype(jnp.int32)
-    return _Positions(jnp.clip(nearest, 0, size - 1), low, jnp.minimum(low + 1, size - 1), exact - low, inside)
+    return _Positions(jnp.clip(nearest, 0, last), low, jnp.minimum(low + 1, last), exact - low, inside)
 
 
 def _between(before: Array, after: Array, share: Array) -> Array:
@@ -154,11 +182,11 @@ def _between(before: Array, after: Array, share: Array) -> Array:
 def change_light(
     key: PRNGKeyArray, image: Float[Array, "h w 3"], options: AugmentationOptions
 ) -> Float[Array, "h w 3"]:
-    """Changes brightness, contrast, saturation, gamma, hue and noise, each drawn within its option.
+    """Changes hue, saturation, tint, contrast, brightness, gamma and noise, or turns all to grey, as the options say.
 
     A change whose option is 0 is not compiled in.
     """
-    keys = jax.random.split(key, 6)
+    keys = jax.random.split(key, 8)
 
     def factor(index: int, spread: float) -> Array:
         return jnp.exp(jax.random.uniform(keys[index], minval=-1.0, maxval=1.0) * jnp.log1p(spread))
@@ -169,6 +197,9 @@ def change_light(
     if options.saturation:
         amount, grey = factor(1, options.saturation), _luma(red, green, blue)
         red, green, blue = (_between(grey, channel, amount) for channel in (red, green, blue))
+    if options.tint:
+        gains = jnp.exp(jax.random.uniform(keys[6], (3,), minval=-1.0) * jnp.log1p(options.tint))
+        red, green, blue = (channel * gain for channel, gain in zip((red, green, blue), gains, strict=True))
     if options.contrast:
         amount, level = factor(2, options.contrast), _luma(red, green, blue).mean()
         red, green, blue = (_between(level, channel, amount) for channel in (red, green, blue))
@@ -180,6 +211,10 @@ def change_light(
         image = 255 * (image / 255) ** factor(4, options.gamma)
     if options.noise:
         image = jnp.clip(image + options.noise * jax.random.normal(keys[5], image.shape), 0, 255)
+    if options.grey:
+        # At last: the noise of a grey camera is grey.
+        luma = jnp.broadcast_to(_luma(*jnp.moveaxis(image, -1, 0))[..., None], image.shape)
+        image = jnp.where(jax.random.bernoulli(keys[7], options.grey), luma, image)
     return image
 
 
@@ -206,8 +241,9 @@ def augment(
     original: Bool[Array, ""],
     options: AugmentationOptions,
     fill: tuple[float, ...],
-) -> tuple[Float[Array, "h w 3"], UInt8[Array, "h w"]]:
-    """One training example: a random crop with photometric changes, or the whole image where `original`."""
+    relief: Float[Array, "rH rW R"] | None = None,
+) -> Crop:
+    """One training example: a random crop with its light and relief changed, or the whole image where `original`."""
     window_key, light_key = jax.random.split(key)
     drawn = draw_window(window_key, labels, size_px, options)
     window = jax.tree.map(
@@ -215,7 +251,51 @@ def augment(
     )
     crop, near = cut(window, image, labels, size_px, options.crop_px, fill)
     lit = change_light_inside(light_key, window, crop, size_px, options)
-    return jnp.where(original, crop, lit), near
+    if relief is None:
+        return Crop(jnp.where(original, crop, lit), near)
+    part = cut_relief(window, relief, size_px, options.crop_px)
+    lit, changed = change_relief(jax.random.fold_in(key, 1), lit, part, options, fill)
+    return Crop(jnp.where(original, crop, lit), near, jnp.where(original, part, changed))
+
+
+def change_relief(
+    key: PRNGKeyArray,
+    image: Float[Array, "h w 3"],
+    relief: Float[Array, "rh rw R"],
+    options: AugmentationOptions,
+    fill: tuple[float, ...],
+) -> tuple[Float[Array, "h w 3"], Float[Array, "rh rw R"]]:
+    """Disturbs the relief, and takes away one of the two inputs of some examples, so that neither is trusted blindly.
+
+    The image, which becomes flat, is only taken away where there is relief to learn from.
+    """
+    disturb_key, drop_key = jax.random.split(key)
+    if options.disturb_relief:
+        relief = disturb_relief(disturb_key, relief, options.disturb_relief)
+    chance = jax.random.uniform(drop_key)
+    if options.drop_image:
+        flat = (chance > 1 - options.drop_image) & (relief[..., -1] > 0).any()
+        image = jnp.where(flat, jnp.array(fill), image)
+    return image, jnp.where(chance < options.drop_relief, 0.0, relief)
+
+
+def disturb_relief(key: PRNGKeyArray, relief: Float[Array, "h w R"], strength: float) -> Float[Array, "h w R"]:
+    """Offsets, tilts, bumps and noise in the channels of relief, and holes in which it is unknown.
+
+    The amount is drawn evenly up to `strength`, which is the standard deviation in units of the channels.
+    """
+    height, width, channels = relief.shape
+    amount_key, shift_key, noise_key, hole_key = jax.random.split(key, 4)
+    amount = strength * jax.random.uniform(amount_key)
+
+    def smooth(key: Array, nodes: int, count: int) -> Array:
+        drawn = jax.random.normal(key, (nodes, nodes, count))
+        return jax.image.resize(drawn, (height, width, count), "linear")
+
+    noise = 0.5 * jax.random.normal(noise_key, (height, width, channels - 1))
+    error = amount * (smooth(shift_key, 3, channels - 1) + noise) * relief[..., -1:]
+    hole = smooth(hole_key, 8, 1) < 2 * amount - 2
+    return jnp.where(hole, 0.0, relief.at[..., :-1].add(error))
 
 
 def change_light_inside(

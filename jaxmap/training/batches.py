@@ -7,13 +7,15 @@ from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float16, Int, UInt8
 
+from jaxmap.geometry.relief import RELIEF_CHANNELS, RELIEF_STRIDE
 from jaxmap.host.prefetch import prefetch
 from jaxmap.labels import IGNORE
 from jaxmap.training.data import Example, read_example
 from jaxmap.training.masks import MaskLookup
 from jaxmap.training.options import TrainingOptions
+from jaxmap.training.relief import read_relief
 from jaxmap.training.step import Batch
 
 CACHE_BYTES = 2 * 2**30
@@ -68,18 +70,35 @@ class ExampleOrder(NamedTuple):
         return np.stack([epochs, chosen], axis=1).astype(np.int32)
 
 
-class ExampleReader:
-    """Reads examples and makes batches of them; as many as fit into `cache_bytes` stay in memory."""
+class RawExample(NamedTuple):
+    """An image as it was read, its labels, and its relief, where the network sees any."""
 
-    def __init__(self, examples: Sequence[Example], lookup: MaskLookup, cache_bytes: int = CACHE_BYTES) -> None:
-        self._examples, self._lookup = examples, lookup
-        self._kept: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    image: UInt8[np.ndarray, "H W 3"]
+    labels: UInt8[np.ndarray, "H W"]
+    relief: Float16[np.ndarray, "h w R"] | None
+
+
+class ExampleReader:
+    """Reads examples and makes batches of them; as many as fit into `cache_bytes` stay in memory.
+
+    Args:
+        examples: the training examples.
+        lookup: from the pixels of their masks to labels.
+        relief: whether the network sees relief.
+        cache_bytes: what may be kept.
+    """
+
+    def __init__(
+        self, examples: Sequence[Example], lookup: MaskLookup, *, relief: bool = False, cache_bytes: int = CACHE_BYTES
+    ) -> None:
+        self._examples, self._lookup, self._relief = examples, lookup, relief
+        self._kept: dict[int, RawExample] = {}
         self._room, self._lock = cache_bytes, Lock()
         self.height_px = max(example.size_px[0] for example in examples)
         self.width_px = max(example.size_px[1] for example in examples)
 
-    def read(self, index: int) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
-        """An image and its labels.
+    def read(self, index: int) -> RawExample:
+        """An image, its labels, and its relief.
 
         Raises:
             JaxmapError: they cannot be read.
@@ -87,12 +106,13 @@ class ExampleReader:
         kept = self._kept.get(index)
         if kept is not None:
             return kept
-        pair = read_example(self._examples[index], self._lookup)
-        taken = sum(array.nbytes for array in pair)
+        example = self._examples[index]
+        raw = RawExample(*read_example(example, self._lookup), read_relief(example) if self._relief else None)
+        taken = sum(array.nbytes for array in raw if array is not None)
         with self._lock:
             if index not in self._kept and taken <= self._room:
-                self._kept[index], self._room = pair, self._room - taken
-        return pair
+                self._kept[index], self._room = raw, self._room - taken
+        return raw
 
     def batch(self, draws: Int[np.ndarray, "B 2"], order: ExampleOrder) -> Batch:
         """The batch of these draws.
@@ -103,16 +123,20 @@ class ExampleReader:
         count = len(draws)
         images = np.zeros((count, self.height_px, self.width_px, 3), np.uint8)
         labels = np.full((count, self.height_px, self.width_px), IGNORE, np.uint8)
+        coarse_px = -(-self.height_px // RELIEF_STRIDE), -(-self.width_px // RELIEF_STRIDE)
+        relief = np.zeros((count, *coarse_px, RELIEF_CHANNELS), np.float16) if self._relief else None
         sizes = np.zeros((count, 2), np.int32)
         for place, example in enumerate(draws[:, 1]):
-            image, mask = self.read(int(example) // order.variants)
-            sizes[place] = mask.shape
-            images[place, : mask.shape[0], : mask.shape[1]] = image
-            labels[place, : mask.shape[0], : mask.shape[1]] = mask
+            raw = self.read(int(example) // order.variants)
+            sizes[place] = height, width = raw.labels.shape
+            images[place, :height, :width] = raw.image
+            labels[place, :height, :width] = raw.labels
+            if relief is not None and raw.relief is not None:
+                relief[place, : raw.relief.shape[0], : raw.relief.shape[1]] = raw.relief
         fixed = order.variants > 1
         seeds = np.stack([np.zeros(count, np.int32) if fixed else draws[:, 0], draws[:, 1]], axis=1)
         originals = (draws[:, 1] % order.variants == 0) & fixed
-        return Batch(images, labels, sizes, seeds, originals)  # type: ignore[arg-type]
+        return Batch(images, labels, sizes, seeds, originals, relief)  # type: ignore[arg-type]
 
 
 def batches_from(pixels: ExampleReader, order: ExampleOrder, first_step: int) -> Iterator[Batch]:

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Int64, UInt8
+from jaxtyping import Float32, Int64, UInt8
 
 from jaxmap.datasets.images import IMAGE_SUFFIXES, image_size_px, read_image
+from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, stereo_paths
 from jaxmap.errors import JaxmapError
 from jaxmap.models.tensor_files import shortened
 from jaxmap.training.masks import (
@@ -48,12 +49,14 @@ class Example(NamedTuple):
         image: the image file.
         mask: the mask file.
         size_px: (height, width) of the image, from its header.
+        stereo: folder of `disparity/NAME.png` and `cameras/NAME.json`; None where there are none or none are wanted.
     """
 
     name: str
     image: Path
     mask: Path
     size_px: tuple[int, int]
+    stereo: Path | None = None
 
 
 class TrainingSet(NamedTuple):
@@ -108,6 +111,42 @@ def open_training_set(
     return TrainingSet(folder, lookup.classes, examples(split.train), examples(split.validation), lookup, split.notes)
 
 
+def with_stereo(training_set: TrainingSet) -> TrainingSet:
+    """The same examples, with the disparity and the camera of those that have them.
+
+    Raises:
+        JaxmapError: no training image has them.
+    """
+    folder = training_set.folder
+
+    def added(examples: tuple[Example, ...]) -> tuple[Example, ...]:
+        there = (any(path.exists() for path in stereo_paths(folder, example.name)) for example in examples)
+        return tuple(
+            example._replace(stereo=folder if found else None) for example, found in zip(examples, there, strict=True)
+        )
+
+    result = training_set._replace(train=added(training_set.train), validation=added(training_set.validation))
+    if not any(example.stereo for example in result.train):
+        raise JaxmapError(
+            "no training image has a disparity, and the network sees relief",
+            where=folder,
+            fix="put disparity/NAME.png and cameras/NAME.json beside images and masks, or leave out --network.relief",
+        )
+    return result
+
+
+def read_disparity(example: Example) -> tuple[Float32[np.ndarray, "H W"], LevelCamera] | None:
+    """The disparity of an image (NaN where unknown) and its camera; None where it has none.
+
+    Raises:
+        JaxmapError: a file cannot be read or is missing, or the disparity has another size than the image.
+    """
+    stereo = None if example.stereo is None else read_stereo(example.stereo, example.name)
+    if stereo is not None and example.stereo is not None:
+        _check_size(stereo[0], example, "disparity", stereo_paths(example.stereo, example.name)[0])
+    return stereo
+
+
 def read_example(example: Example, lookup: MaskLookup) -> tuple[Pixels, Labels]:
     """Reads an image and its labels; grey images become RGB.
 
@@ -115,19 +154,19 @@ def read_example(example: Example, lookup: MaskLookup) -> tuple[Pixels, Labels]:
 
     Returns:
         image: uint8 (H, W, 3).
-        labels: uint8 (H, W): class indices, and 255 for none.
+        labels: uint8 (H, W): class indices, 255 for none, and 254 for any class but the negated one.
 
     Raises:
         JaxmapError: a file cannot be read, they differ in size, or a pixel of the mask stands for nothing.
     """
     image = _read_rgb(example)
     labels = read_labels(example.mask, lookup)
-    _check_size(labels, example)
+    _check_size(labels, example, "mask", example.mask)
     return image, labels
 
 
 def check_training_set(training_set: TrainingSet) -> Int64[np.ndarray, "2 C"]:
-    """Reads every image and mask once, so that no fault is found hours later.
+    """Reads every image, mask and disparity once, so that no fault is found hours later.
 
     Returns:
         Pixels of each class in training (row 0) and in validation (row 1).
@@ -143,8 +182,9 @@ def check_training_set(training_set: TrainingSet) -> Int64[np.ndarray, "2 C"]:
     def count(entry: tuple[int, Example]) -> np.ndarray:
         row, example = entry
         _read_rgb(example)
+        read_disparity(example)
         codes = read_codes(example.mask, lookup)
-        _check_size(codes, example)
+        _check_size(codes, example, "mask", example.mask)
         # Threads may meet here, but all of them only ever write True.
         seen[row][codes] = True
         return np.bincount(lookup.table[codes].ravel(), minlength=256)
@@ -170,11 +210,12 @@ def digest(training_set: TrainingSet) -> str:
         JaxmapError: a file is missing.
     """
     text = hashlib.sha256(training_set.lookup.table.tobytes())
-    text.update(repr((training_set.classes, training_set.lookup.kind)).encode())
+    text.update(repr((training_set.classes, training_set.lookup.kind, training_set.lookup.negated)).encode())
     for part in (training_set.train, training_set.validation):
         text.update(f"{len(part)}\n".encode())
         for example in part:
-            sizes = (*example.size_px, _file_size(example.image), _file_size(example.mask))
+            stereo = () if example.stereo is None else stereo_paths(example.stereo, example.name)
+            sizes = (*example.size_px, *map(_file_size, (example.image, example.mask, *stereo)))
             text.update(os.fsencode(f"{example.name}\0{sizes}\n"))
     return text.hexdigest()
 
@@ -190,12 +231,13 @@ def _read_rgb(example: Example) -> Pixels:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def _check_size(mask: np.ndarray, example: Example) -> None:
-    if mask.shape != example.size_px:
+def _check_size(pixels: np.ndarray, example: Example, kind: str, where: Path) -> None:
+    if pixels.shape != example.size_px:
+        (height, width), (rows, columns) = example.size_px, pixels.shape
         raise JaxmapError(
-            f"the mask is {mask.shape[1]}x{mask.shape[0]} px, the image {example.size_px[1]}x{example.size_px[0]} px",
-            where=example.mask,
-            fix="give masks of the images' own size",
+            f"the {kind} is {columns}x{rows} px, the image {width}x{height} px",
+            where=where,
+            fix=f"give each {kind} the size of its image",
         )
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 
 from jaxmap.errors import UsageError
+from jaxmap.geometry.relief import RELIEF_CHANNELS
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import Weights, initial_weights
@@ -104,6 +105,8 @@ def _architecture(
     options: NetworkOptions, classes: tuple[str, ...], init: SavedModel | None, where: Path | str
 ) -> Architecture:
     chosen = {name: value for name in _CHOICES if (value := getattr(options, name)) is not None}
+    if options.relief is not None:
+        chosen["relief_channels"] = RELIEF_CHANNELS if options.relief else 0
     if init is None:
         return replace(_of_family(options, classes), **chosen)
     trained = init.architecture

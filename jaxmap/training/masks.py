@@ -12,14 +12,16 @@ from jaxtyping import Bool, Int32, UInt8
 from PIL import Image
 
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.labels import IGNORE
+from jaxmap.labels import ANY_OTHER, IGNORE
 from jaxmap.models.tensor_files import shortened
 
 IGNORED = "ignore"
 """What a remap or a palette calls pixels that carry no class."""
 REST = "*"
 """Stands for every value or colour that is not named."""
-UNNAMED = 254
+NOT = "not "
+"""Before a class, stands for any class but that one."""
+UNNAMED = 253
 """What `MaskLookup.table` holds for a code that stands for nothing."""
 
 _REMAP, _PALETTE = "--data.remap", "--data.palette"
@@ -36,11 +38,13 @@ class MaskLookup(NamedTuple):
         classes: names in the order of the labels.
         kind: whether a code is a class index, another value, or a colour (`0xRRGGBB`).
         table: the label of every code; `UNNAMED` where it stands for nothing.
+        negated: index of the class that pixels labelled `ANY_OTHER` are not of; None where no code says that.
     """
 
     classes: tuple[str, ...]
     kind: Kind
     table: UInt8[np.ndarray, " N"]
+    negated: int | None = None
 
 
 def make_mask_lookup(
@@ -50,22 +54,24 @@ def make_mask_lookup(
 
     Args:
         classes: names in the order of the labels.
-        remap: class, or `"ignore"`, by value of the mask (0 to 65535); the key `"*"` is every other value.
-        palette: colours by class or `"ignore"`: `"#rrggbb"`, several with blanks between them, or `"*"` for every
+        remap: class, `"not CLASS"` or `"ignore"`, by value of the mask (0 to 65535); the key `"*"` is every other
+            value.
+        palette: colours by the same names: `"#rrggbb"`, several with blanks between them, or `"*"` for every
             other colour.
 
     Raises:
-        UsageError: faulty classes, values or colours, something named twice, or a class that nothing stands for.
+        UsageError: faulty classes, values or colours, something named twice, a class that nothing stands for, or
+            several negated ones.
     """
     names = _checked_classes(classes)
     if remap and palette:
         raise UsageError("masks have either values or colours", where=_PALETTE, fix=f"leave out {_REMAP}")
     if palette:
-        return MaskLookup(names, "colours", _colour_table(names, palette))
+        return _colour_lookup(names, palette)
     if remap:
-        return MaskLookup(names, "values", _value_table(names, remap))
+        return _value_lookup(names, remap)
     indices = {**dict(enumerate(names)), IGNORE: IGNORED}
-    return MaskLookup(names, "indices", _table(_VALUES, names, indices, None, _REMAP))
+    return _lookup("indices", names, indices, None, _REMAP)
 
 
 def read_codes(path: Path, lookup: MaskLookup) -> Int32[np.ndarray, "H W"]:
@@ -95,7 +101,7 @@ def read_codes(path: Path, lookup: MaskLookup) -> Int32[np.ndarray, "H W"]:
 
 
 def read_labels(path: Path, lookup: MaskLookup) -> UInt8[np.ndarray, "H W"]:
-    """The labels of a mask: class indices, and 255 for none.
+    """The labels of a mask: class indices, 255 for none, and 254 for any class but the negated one.
 
     Raises:
         JaxmapError: the mask cannot be read, or holds codes that stand for nothing.
@@ -151,8 +157,11 @@ def code_text(lookup: MaskLookup, code: int) -> str:
 
 
 def meaning(lookup: MaskLookup, code: int) -> str:
-    """The class that a code stands for, or `"ignore"`."""
+    """The class that a code stands for, `"not CLASS"`, or `"ignore"`."""
     label = int(lookup.table[code])
+    if label == ANY_OTHER:
+        assert lookup.negated is not None
+        return NOT + lookup.classes[lookup.negated]
     return IGNORED if label == IGNORE else lookup.classes[label]
 
 
@@ -166,7 +175,7 @@ def _checked_classes(classes: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _value_table(classes: tuple[str, ...], remap: Mapping[str, str]) -> np.ndarray:
+def _value_lookup(classes: tuple[str, ...], remap: Mapping[str, str]) -> MaskLookup:
     named: dict[int, str] = {}
     for key, name in remap.items():
         if str(key) == REST:
@@ -178,10 +187,10 @@ def _value_table(classes: tuple[str, ...], remap: Mapping[str, str]) -> np.ndarr
             )
         if named.setdefault(int(text), name) != name:
             raise UsageError(f"two classes for the value {text}", where=_REMAP, fix="name it once")
-    return _table(_VALUES, classes, named, remap.get(REST), _REMAP)
+    return _lookup("values", classes, named, remap.get(REST), _REMAP)
 
 
-def _colour_table(classes: tuple[str, ...], palette: Mapping[str, str]) -> np.ndarray:
+def _colour_lookup(classes: tuple[str, ...], palette: Mapping[str, str]) -> MaskLookup:
     named: dict[int, str] = {}
     rest: str | None = None
     for name, colours in palette.items():
@@ -196,23 +205,27 @@ def _colour_table(classes: tuple[str, ...], palette: Mapping[str, str]) -> np.nd
             code = int(colour[1:], 16)
             if (other := named.setdefault(code, name)) != name:
                 raise UsageError(f"{other} and {name} share #{code:06x}", where=_PALETTE, fix="a colour is one class's")
-    return _table(_COLOURS, classes, named, rest, _PALETTE)
+    return _lookup("colours", classes, named, rest, _PALETTE)
 
 
-def _table(
-    length: int, classes: tuple[str, ...], named: Mapping[int, str], rest: str | None, where: str
-) -> UInt8[np.ndarray, " N"]:
-    label = {**{name: index for index, name in enumerate(classes)}, IGNORED: IGNORE}
+def _lookup(kind: Kind, classes: tuple[str, ...], named: Mapping[int, str], rest: str | None, where: str) -> MaskLookup:
+    label = {NOT + name: ANY_OTHER for name in classes}
+    label |= {**{name: index for index, name in enumerate(classes)}, IGNORED: IGNORE}
     given = {*named.values(), *([] if rest is None else [rest])}
     if unknown := sorted(map(str, given - label.keys())):
-        fix = f"the classes are {', '.join(classes)}, and {IGNORED}"
+        fix = f"the classes are {', '.join(classes)}; {NOT}CLASS and {IGNORED} are known, too"
         raise UsageError(f"unknown class {shortened(unknown)}", where=where, fix=fix)
     if missing := [name for name in classes if name not in given]:
         raise UsageError(f"nothing stands for {shortened(missing)}", where=where, fix="name every class")
-    table = np.full(length, UNNAMED if rest is None else label[rest], np.uint8)
+    negated = sorted(name for name in given if label[name] == ANY_OTHER)
+    if len(negated) > 1:
+        raise UsageError(f"several classes are negated: {shortened(negated)}", where=where, fix="negate one of them")
+    if negated and len(classes) == 1:
+        raise UsageError(f"{negated[0]} leaves no class", where=where, fix="name the others in --classes")
+    table = np.full(_COLOURS if kind == "colours" else _VALUES, UNNAMED if rest is None else label[rest], np.uint8)
     for code, name in named.items():
         table[code] = label[name]
-    return table
+    return MaskLookup(classes, kind, table, classes.index(negated[0].removeprefix(NOT)) if negated else None)
 
 
 def _without_alpha(image: Image.Image) -> Image.Image:

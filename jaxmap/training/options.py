@@ -25,7 +25,8 @@ class DataOptions:
     """What the pixels of masks stand for, and which images validate."""
 
     remap: dict[MaskValue, str] | None = None
-    """Class by value of the masks, such as 255 rock; "ignore" is no class, and the value * every other."""
+    """Class by value of the masks, such as 255 rock; "ignore" is no class, "not rock" any class but that one, and the
+    value * every other."""
     palette: dict[str, str] | None = None
     """Colour of the masks by class, such as rock #ff0000; several of a class with blanks between."""
     validation_share: Share = 0.2
@@ -56,13 +57,27 @@ class AugmentationOptions:
     """The same for the exponent of the tone curve."""
     hue_rad: NotNegative = 0.0
     """Greatest rotation of colours around the grey axis."""
+    tint: NotNegative = 0.0
+    """Each channel is multiplied by up to 1 + this, or divided by it."""
+    grey: Annotated[float, Interval(ge=0, le=1)] = 0.0
+    """Share of the examples that are turned to grey."""
     noise: NotNegative = 0.0
     """Standard deviation of added noise, on a scale of 0 to 255."""
+    drop_relief: Annotated[float, Interval(ge=0, le=1)] = 0.0
+    """Share of the examples whose relief is unknown everywhere, so that the image alone is learnt from, too."""
+    drop_image: Annotated[float, Interval(ge=0, le=1)] = 0.0
+    """Share of the examples with relief whose image is a flat colour, so that the relief alone is learnt from, too."""
+    disturb_relief: Annotated[float, Interval(ge=0, le=1)] = 0.0
+    """Greatest strength of offsets, tilts, noise and holes in the relief."""
 
     def __post_init__(self) -> None:
         low, high = self.scale
         if low > high:
             raise UsageError(f"augmentation.scale is {low} {high}", fix="give the least factor first")
+        if self.drop_relief + self.drop_image > 1:
+            raise UsageError(
+                "drop_relief and drop_image are more than all examples", where="augmentation", fix="take smaller shares"
+            )
 
 
 @options("loss")
@@ -159,6 +174,8 @@ class NetworkOptions:
     """Separable convolutions of the decoder."""
     low_level_channels: Annotated[int, Interval(ge=1, le=4096)] | None = None
     """Channels the low-level feature is reduced to."""
+    relief: bool | None = None
+    """Whether the decoder also sees the relief of the ground, from disparity/NAME.png and cameras/NAME.json."""
     top_conv: bool | None = None
     """Whether MobileNetV2 or EfficientNet-Lite0 keeps its last convolution, to 1280 channels."""
     dropout: Share | None = None

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, ArrayLike, Bool, Float, Float16, Int, PRNGKeyArray, UInt8
 
 from jaxmap.labels import IGNORE
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, training_form
-from jaxmap.training.augment import augment
-from jaxmap.training.losses import total_loss
+from jaxmap.training.augment import Crop, augment
+from jaxmap.training.losses import correct, total_loss
 from jaxmap.training.options import OptimiserOptions, TrainingOptions
 
 _STATISTICS = (".norm.mean", ".norm.var")
@@ -30,6 +30,7 @@ class Batch(NamedTuple):
         sizes_px: height and width of each image without it.
         draws: folded into the key of each example: (epoch, or 0 where examples are fixed; example).
         originals: whether the whole image is the example, not a crop of it.
+        relief: of the images, at `RELIEF_STRIDE`; None where the network sees none.
     """
 
     images: UInt8[Array, "B H W 3"]
@@ -37,6 +38,7 @@ class Batch(NamedTuple):
     sizes_px: Int[Array, "B 2"]
     draws: Int[Array, "B 2"]
     originals: Bool[Array, "B"]
+    relief: Float16[Array, "B h w R"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -74,7 +76,7 @@ class Trainer(NamedTuple):
         init: `(weights) -> TrainState`.
         step: `(state, batch, key) -> (state, StepMetrics)`, compiled once; the state passed in is donated. The
             key is the same for all steps: draws and the number of the step are folded into it.
-        loss: `(weights, images, labels, key) -> (loss, (logits, statistics))`, not compiled.
+        loss: `(weights, crops, key) -> (loss, (logits, statistics))`, of a batch of crops; not compiled.
     """
 
     init: Callable[[Weights], TrainState]
@@ -89,6 +91,7 @@ def make_trainer(
     steps: int,
     class_weights: Float[Array, "C"],
     batch_norms: tuple[str, ...] = (),
+    negated: int | None = None,
 ) -> Trainer:
     """Builds the functions of a training run.
 
@@ -98,34 +101,36 @@ def make_trainer(
         steps: of the whole run, for the schedule.
         class_weights: of the cross-entropy.
         batch_norms: prefixes of the blocks whose batch norms train; the others are frozen.
+        negated: the class that pixels labelled `ANY_OTHER` are not of.
     """
     network = training_form(architecture, batch_norms)
     updater = make_updater(options, steps)
     fill = tuple(255 * value for value in architecture.mean)
 
-    def loss(weights: Weights, images: Array, labels: Array, key: Array) -> tuple[Array, tuple[Array, Weights]]:
-        logits, statistics = network(weights, images, key)
-        return total_loss(logits, labels, class_weights, options.loss), (logits, statistics)
+    def loss(weights: Weights, crops: Crop, key: Array) -> tuple[Array, tuple[Array, Weights]]:
+        logits, statistics = network(weights, crops.image, key, crops.relief)
+        return total_loss(logits, crops.labels, class_weights, options.loss, negated), (logits, statistics)
 
-    def examples(batch: Batch, key: Array) -> tuple[Array, Array]:
-        def one(image: Array, labels: Array, size_px: Array, draw: Array, original: Array) -> tuple[Array, Array]:
-            drawn = jax.random.fold_in(jax.random.fold_in(key, draw[0]), draw[1])
-            return augment(drawn, image, labels, size_px, original, options.augmentation, fill)
+    def crops_of(batch: Batch, key: Array) -> Crop:
+        def one(of: Batch) -> Crop:
+            drawn = jax.random.fold_in(jax.random.fold_in(key, of.draws[0]), of.draws[1])
+            size_px, original = of.sizes_px, of.originals
+            return augment(drawn, of.images, of.labels, size_px, original, options.augmentation, fill, of.relief)
 
-        return jax.vmap(one)(*batch)
+        return jax.vmap(one)(batch)
 
     def step(state: TrainState, batch: Batch, key: PRNGKeyArray) -> tuple[TrainState, StepMetrics]:
         augment_key, dropout_key = jax.random.split(key)
         with jax.named_scope("augment"):
-            images, labels = jax.lax.optimization_barrier(examples(batch, augment_key))
+            crops = jax.lax.optimization_barrier(crops_of(batch, augment_key))
         trained, fixed = parted(state.weights, options)
 
         def of_trained(trained: Weights) -> tuple[Array, tuple[Array, Weights]]:
-            return loss({**fixed, **trained}, images, labels, jax.random.fold_in(dropout_key, state.step))
+            return loss({**fixed, **trained}, crops, jax.random.fold_in(dropout_key, state.step))
 
         (value, (logits, statistics)), gradient = jax.value_and_grad(of_trained, has_aux=True)(trained)
-        known = labels != IGNORE
-        right = known & (logits.argmax(axis=-1) == labels)
+        known = crops.labels != IGNORE
+        right = known & correct(logits.argmax(axis=-1), crops.labels, negated)
         accuracy = right.sum() / jnp.maximum(known.sum(), 1)
         return updater.update(state, value, accuracy, gradient, statistics)
 

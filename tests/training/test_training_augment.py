@@ -16,11 +16,14 @@ from tiny_training import compiled_quickly
 
 from jaxmap.labels import IGNORE
 from jaxmap.training.augment import (
+    Crop,
     CropWindow,
     augment,
     change_light,
     cut,
     cut_nearest,
+    cut_relief,
+    disturb_relief,
     draw_pixel,
     draw_window,
     whole_window,
@@ -38,10 +41,13 @@ OPTIONS = AugmentationOptions(crop_px=CROP_PX, scale=(0.4, 2.5))
 LIGHT = replace(OPTIONS, brightness=0.5, contrast=0.5, saturation=0.5, gamma=0.5, hue_rad=0.5, noise=9.0)
 
 fast_cut = jax.jit(partial(cut, crop_px=CROP_PX, fill=FILL))
+fast_relief = jax.jit(partial(cut_relief, crop_px=CROP_PX))
+disturb = jax.jit(partial(disturb_relief, strength=0.3))
 fast_draw = jax.jit(partial(draw_window, options=OPTIONS))
 around_draw = jax.jit(partial(draw_window, options=replace(OPTIONS, class_share=1.0)))
 draw_pixels = jax.jit(jax.vmap(draw_pixel, in_axes=(0, None, None)))
 fast_augment = jax.jit(partial(augment, options=OPTIONS, fill=FILL))
+SEEING = replace(OPTIONS, scale=(1.0, 1.0), drop_relief=0.25, drop_image=0.25)
 lit_augment = jax.jit(jax.vmap(partial(augment, options=LIGHT, fill=FILL)))
 """Of two examples at once."""
 
@@ -49,6 +55,14 @@ sizes = st.tuples(st.integers(1, STORED_PX[0]), st.integers(1, STORED_PX[1]))
 scales = st.floats(0.25, 4.0, width=32)
 offsets = st.tuples(st.integers(-20, 40), st.integers(-20, 40))
 seeds = st.integers(0, 2**31 - 1)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(0, None, None))
+def seeing_augment(key: jax.Array, image: jax.Array, relief: jax.Array) -> Crop:
+    """Of one example with relief, under many keys."""
+    labels, size_px = jnp.zeros(STORED_PX, jnp.uint8), jnp.array(STORED_PX)
+    return augment(key, image, labels, size_px, jnp.array(False), SEEING, FILL, relief)
 
 
 def view_of(scale: float, offset_px: tuple[int, int], mirrored: bool) -> CropWindow:
@@ -74,8 +88,8 @@ def lit(*words: tuple) -> tuple[np.ndarray, np.ndarray]:
     seeds, images, labels, sizes_px, originals = zip(*words, strict=True)
     keys = jax.vmap(jax.random.key)(np.array(seeds))
     arrays = map(np.array, (images, labels, np.array(sizes_px, np.int32), originals))
-    crops, near = lit_augment(keys, *arrays)
-    return np.asarray(crops), np.asarray(near)
+    crops = lit_augment(keys, *arrays)
+    return np.asarray(crops.image), np.asarray(crops.labels)
 
 
 def coded(size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -104,6 +118,63 @@ def test_no_label_comes_out_that_was_not_there(size_px, scale, offset_px, mirror
     filled = (crop == np.array(FILL, np.float32)).all(axis=-1)
     assert (near[filled & (near != IGNORE)] <= 4).all()
     assert crop[~filled].max(initial=0) < 200
+
+
+@given(sizes, scales, offsets, st.booleans(), seeds)
+def test_a_cut_of_relief_is_its_slow_twin(size_px, scale, offset_px, mirrored, seed):
+    relief = np.random.default_rng(seed).standard_normal((5, 6, 2)).astype(np.float32)
+    # Halfway between two pixels of relief, whether they lie inside depends on the last bit.
+    edges = [(4 * np.arange(5) + 2 + start) / scale / 4 for start in offset_px]
+    assume(
+        all(
+            abs(np.append(places, places - size / 4) % 1).min() > 1e-3
+            for places, size in zip(edges, size_px, strict=True)
+        )
+    )
+    part = fast_relief(view_of(scale, offset_px, mirrored), relief, size_px=np.array(size_px, np.int32))
+    expected = reference_augment.cut_relief(scale, offset_px, mirrored, relief, size_px, CROP_PX)
+    np.testing.assert_allclose(part, expected, atol=1e-4)
+
+
+@given(st.floats(0.5, 2.0, width=32), st.tuples(st.integers(0, 8), st.integers(0, 8)), st.booleans())
+def test_relief_stays_on_its_image(scale, offset_px, mirrored):
+    """Both show a ramp; so do their crops, one at every fourth place of the other."""
+    rows, columns = np.indices(STORED_PX)
+    ramp = np.stack([5 * rows, 5 * columns, 0 * rows], axis=-1)
+    window = view_of(scale, offset_px, mirrored)
+    crop, near = cut_of(window, ramp.astype(np.uint8), np.zeros(STORED_PX, np.uint8), STORED_PX)
+    relief = ramp.reshape(5, 4, 6, 4, 3).mean(axis=(1, 3)).astype(np.float32)
+    part = np.asarray(fast_relief(window, relief, size_px=np.array(STORED_PX, np.int32)))
+    means = crop[:16, :16].reshape(4, 4, 4, 4, 3).mean(axis=(1, 3))
+    whole = (near[:16, :16] == 0).reshape(4, 4, 4, 4).all(axis=(1, 3))
+    # Not at the edge of the image, where the ramp of the relief ends half a pixel of relief earlier.
+    inner = whole & (means[..., :2] > 15).all(axis=-1) & (means[..., :2] < 5 * np.array(STORED_PX) - 20).all(axis=-1)
+    np.testing.assert_allclose(part[:4, :4][inner], means[inner], atol=0.02)
+
+
+@given(seeds)
+def test_disturbed_relief_stays_unknown_where_it_was(seed):
+    draw = np.random.default_rng(seed)
+    relief = draw.standard_normal((5, 6, 4)).astype(np.float32)
+    relief[..., -1] = draw.random((5, 6)) < 0.7
+    relief *= relief[..., -1:]
+    changed = np.asarray(disturb(jax.random.key(seed), relief))
+    hole = changed[..., -1] != relief[..., -1]
+    assert (changed[hole] == 0).all() and (changed[relief[..., -1] == 0] == 0).all() and hole.mean() < 0.6
+    error = (changed - relief)[~hole & (relief[..., -1] > 0)]
+    assert (np.abs(error[..., :-1]) < 0.3 * 6).all() and (error[..., -1] == 0).all()
+
+
+def test_either_input_is_dropped_but_not_both():
+    image = np.full((*STORED_PX, 3), 90, np.uint8)
+    known, unknown = np.ones((5, 6, 3), np.float32), np.zeros((5, 6, 3), np.float32)
+    keys = jax.random.split(jax.random.key(0), 400)
+    crops = [seeing_augment(keys, image, relief) for relief in (known, unknown)]
+    flat, blind = ((np.asarray(crop.image) == FILL).all(axis=(1, 2, 3)) for crop in crops)
+    dropped = ~np.asarray(crops[0].relief).any(axis=(1, 2, 3))
+    assert abs(flat.mean() - 0.25) < 0.08 and abs(dropped.mean() - 0.25) < 0.08
+    assert not (flat & dropped).any() and not blind.any()
+    assert (np.asarray(crops[0].image)[~flat] == 90).all() and (np.asarray(crops[0].relief)[~dropped] == 1).all()
 
 
 @given(sizes, scales, offsets, st.booleans())
@@ -272,7 +343,7 @@ def test_the_same_key_is_the_same_example_whatever_stands_beside_it():
 @given(sizes, seeds)
 def test_light_leaves_labels_and_fill_alone(size_px, seed):
     image, labels = example(size_px, seed)
-    plain, near = fast_augment(jax.random.key(seed), image, labels, np.array(size_px, np.int32), np.array(False))
+    plain, near, _ = fast_augment(jax.random.key(seed), image, labels, np.array(size_px, np.int32), np.array(False))
     (crop, _), (labels, _) = lit(*[(seed, image, labels, size_px, False)] * 2)
     np.testing.assert_array_equal(near, labels)
     filled = (np.asarray(plain) == np.array(FILL, np.float32)).all(axis=-1)
@@ -289,7 +360,7 @@ def test_an_original_is_the_image_itself_in_its_own_light():
     assert not np.array_equal(drawn, crop)
 
 
-CHANGES = ("brightness", "contrast", "saturation", "gamma", "hue_rad", "noise")
+CHANGES = ("brightness", "contrast", "saturation", "gamma", "hue_rad", "noise", "tint")
 COLOURS = np.random.default_rng(0).uniform(0, 255, (6, 7, 3)).astype(np.float32)
 
 
@@ -310,6 +381,11 @@ def test_black_and_white_and_grey_stay_in_range(change):
     assert np.isfinite(lit).all() and lit.min() >= 0 and lit.max() <= 255
     if change in ("hue_rad", "saturation"):
         np.testing.assert_allclose(lit, greys, atol=1e-2)
+
+
+def test_a_grey_camera_is_grey_with_its_noise():
+    lit = np.asarray(change_light(jax.random.key(3), COLOURS, AugmentationOptions(grey=1.0, noise=9.0, tint=0.5)))
+    assert (lit == lit[..., :1]).all() and lit[..., 0].std() > 1
 
 
 def test_brightness_and_contrast_by_hand():

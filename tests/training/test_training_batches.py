@@ -122,7 +122,7 @@ def test_a_cache_that_is_full_changes_nothing(opened, pixels):
     for step in range(order.steps):
         for ours, expected in zip(*(reader.batch(order.draws(step), order) for reader in (small, pixels)), strict=True):
             np.testing.assert_array_equal(ours, expected)
-    assert sum(array.nbytes for pair in small._kept.values() for array in pair) <= 2500
+    assert sum(array.nbytes for raw in small._kept.values() for array in raw[:2]) <= 2500
 
 
 def crops_of(pixels: ExampleReader, order: ExampleOrder) -> dict[tuple[int, int], np.ndarray]:
@@ -132,13 +132,13 @@ def crops_of(pixels: ExampleReader, order: ExampleOrder) -> dict[tuple[int, int]
     @jax.jit
     def one(image, labels, size_px, draw, original):
         drawn = jax.random.fold_in(jax.random.fold_in(key, draw[0]), draw[1])
-        return augment(drawn, image, labels, size_px, original, order.options.augmentation, fill)[0]
+        return augment(drawn, image, labels, size_px, original, order.options.augmentation, fill).image
 
     found = {}
     for step in range(order.steps):
         batch = pixels.batch(order.draws(step), order)
         for place, draw in enumerate(order.draws(step).tolist()):
-            found[tuple(draw)] = np.asarray(one(*(array[place] for array in batch)))
+            found[tuple(draw)] = np.asarray(one(*(array[place] for array in batch[:5])))
     return found
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.labels import IGNORE
 from jaxmap.training.data import check_training_set, digest, open_training_set, read_example, split_names
-from jaxmap.training.masks import UNNAMED, make_mask_lookup, read_labels
+from jaxmap.training.masks import UNNAMED, make_mask_lookup, meaning, read_labels
 from jaxmap.training.options import DataOptions
 
 CLASSES = ("sand", "rock")
@@ -198,6 +198,28 @@ def test_the_same_values_in_any_mode(tmp_path, mode) -> None:
     # PNG has neither; readers go by content, not by suffix.
     image.save(path, "tiff" if mode in ("PA", "I") else "png")
     np.testing.assert_array_equal(read_labels(path, make_mask_lookup(CLASSES, None, None)), values)
+
+
+def test_masks_may_say_what_a_pixel_is_not(folder) -> None:
+    values = np.array([[0, 1, 2], [7, 255, 1]], np.uint8)
+    write_mask(folder / "m.png", values)
+    remap = {"0": "sand", "1": "rock", "2": "not rock", "7": "not rock", "255": "ignore"}
+    lookup = make_mask_lookup(CLASSES, remap, None)
+    assert lookup.negated == 1 and meaning(lookup, 7) == "not rock"
+    np.testing.assert_array_equal(read_labels(folder / "m.png", lookup), [[0, 1, 254], [254, 255, 1]])
+    coloured = make_mask_lookup(CLASSES, None, {"sand": "#010101", "rock": "#020202", "not sand": "*"})
+    assert coloured.negated == 0 and coloured.table[9] == 254
+
+
+def test_what_a_pixel_is_not_counts_for_no_class(folder) -> None:
+    mask = np.array(Image.open(folder / "masks/a.png"))
+    mask[4:6] = 9
+    write_mask(folder / "masks/a.png", mask)
+    remap = {"0": "sand", "1": "rock", "9": "not rock", "255": "ignore"}
+    opened = open_training_set(folder, CLASSES, DataOptions(validation_share=0, remap=remap))
+    labels = np.concatenate([read_example(example, opened.lookup)[1].ravel() for example in opened.train])
+    assert check_training_set(opened)[0].tolist() == [(labels == index).sum() for index in range(2)]
+    assert (labels == 254).sum() == 40
 
 
 def test_a_palette_image_is_looked_up_by_its_colours_too(tmp_path) -> None:
@@ -448,7 +470,7 @@ WRONG_OPTIONS = [
     (dict(remap={0: "sand"}), "nothing stands for rock in --data.remap; name every class"),
     (
         dict(remap={0: "sand", 1: "stone"}),
-        "unknown class stone in --data.remap; the classes are sand, rock, and ignore",
+        "unknown class stone in --data.remap; the classes are sand, rock; not CLASS and ignore are known, too",
     ),
     (dict(remap={"x": "sand"}), "'x' is no value of a mask in --data.remap; give 0 to 65535, or \"*\""),
     (dict(remap={-1: "sand"}), "'-1' is no value of a mask in --data.remap; give 0 to 65535, or \"*\""),
@@ -474,8 +496,16 @@ WRONG_OPTIONS = [
         dict(validation_share=float("nan")),
         "data.validation_share is nan: input should be a finite number; choose a valid value",
     ),
-    (dict(classes=()), "faulty classes (none) in --classes; give 1 to 254 different names"),
-    (dict(classes=("a", "a")), "faulty classes a, a in --classes; give 1 to 254 different names"),
+    (dict(classes=()), "faulty classes (none) in --classes; give 1 to 253 different names"),
+    (dict(classes=("a", "a")), "faulty classes a, a in --classes; give 1 to 253 different names"),
+    (
+        dict(remap={0: "sand", 1: "rock", 2: "not rock", 3: "not sand"}),
+        "several classes are negated: not rock, not sand in --data.remap; negate one of them",
+    ),
+    (
+        dict(classes=("rock",), remap={0: "not rock", 1: "rock"}),
+        "not rock leaves no class in --data.remap; name the others in --classes",
+    ),
     (dict(classes=("a", "ignore")), "no class can be called ignore in --classes; name it otherwise"),
 ]
 

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from tiny_training import compiled_quickly
 
 from jaxmap.errors import UsageError
-from jaxmap.labels import IGNORE
-from jaxmap.training.losses import class_weights, total_loss
+from jaxmap.labels import ANY_OTHER, IGNORE
+from jaxmap.training.losses import class_weights, correct, total_loss
 from jaxmap.training.options import PixelLossOptions
 
 quickly = pytest.fixture(scope="module", autouse=True)(compiled_quickly)
 
-PIXELS, CLASSES = 24, 3
+PIXELS, CLASSES, NEGATED = 24, 3, 2
 EQUAL = np.ones(CLASSES, np.float32)
 UNEQUAL = np.array([0.5, 0.7, 1.8], np.float32)
 
@@ -32,18 +32,19 @@ OPTIONS = {
     "lovasz": PixelLossOptions(cross_entropy=0, lovasz=1),
     "all": PixelLossOptions(cross_entropy=0.5, soft_iou=2, lovasz=0.25, label_smoothing=0.1),
 }
-LOSSES = {name: jax.jit(partial(total_loss, options=options)) for name, options in OPTIONS.items()}
-GRADIENTS = {name: jax.jit(jax.grad(partial(total_loss, options=options))) for name, options in OPTIONS.items()}
+TERMS = {name: partial(total_loss, options=options, negated=NEGATED) for name, options in OPTIONS.items()}
+LOSSES = {name: jax.jit(term) for name, term in TERMS.items()}
+GRADIENTS = {name: jax.jit(jax.grad(term)) for name, term in TERMS.items()}
 
 TWINS = {
-    "cross_entropy": lambda logits, labels: reference_losses.cross_entropy(logits, labels, UNEQUAL, 0.0),
-    "smoothed": lambda logits, labels: reference_losses.cross_entropy(logits, labels, UNEQUAL, 0.2),
-    "soft_iou": reference_losses.soft_iou_loss,
-    "lovasz": reference_losses.lovasz_loss,
+    "cross_entropy": lambda logits, labels: reference_losses.cross_entropy(logits, labels, UNEQUAL, 0.0, NEGATED),
+    "smoothed": lambda logits, labels: reference_losses.cross_entropy(logits, labels, UNEQUAL, 0.2, NEGATED),
+    "soft_iou": partial(reference_losses.soft_iou_loss, negated=NEGATED),
+    "lovasz": partial(reference_losses.lovasz_loss, negated=NEGATED),
     "all": lambda logits, labels: (
-        0.5 * reference_losses.cross_entropy(logits, labels, UNEQUAL, 0.1)
-        + 2 * reference_losses.soft_iou_loss(logits, labels)
-        + 0.25 * reference_losses.lovasz_loss(logits, labels)
+        0.5 * reference_losses.cross_entropy(logits, labels, UNEQUAL, 0.1, NEGATED)
+        + 2 * reference_losses.soft_iou_loss(logits, labels, NEGATED)
+        + 0.25 * reference_losses.lovasz_loss(logits, labels, NEGATED)
     ),
 }
 
@@ -66,9 +67,16 @@ def certain(labels: np.ndarray) -> np.ndarray:
     return (100 * np.eye(CLASSES)[np.where(labels == IGNORE, 0, labels)]).astype(np.float32)
 
 
-@given(names, seeds)
-def test_a_loss_is_its_slow_twin(name, seed):
+def negating(labels: np.ndarray, seed: int) -> np.ndarray:
+    """The labels, with "any other class" at half of the pixels that are not of the negated one."""
+    swapped = np.random.default_rng(seed).random(PIXELS) < 0.5
+    return np.where(swapped & (labels != NEGATED) & (labels != IGNORE), np.uint8(ANY_OTHER), labels)
+
+
+@given(names, seeds, st.booleans())
+def test_a_loss_is_its_slow_twin(name, seed, partly):
     logits, labels = drawn(seed)
+    labels = negating(labels, seed) if partly else labels
     loss = LOSSES[name](logits, labels, UNEQUAL)
     assert loss == pytest.approx(TWINS[name](logits.astype(np.float64), labels), abs=2e-5, rel=2e-5)
 
@@ -137,6 +145,7 @@ def test_where_nothing_is_labelled_nothing_is_lost(name):
 @pytest.mark.parametrize("name", OPTIONS)
 def test_losses_of_wild_logits_and_their_gradients_are_finite(name):
     logits, labels = drawn(2)
+    labels[::4] = ANY_OTHER
     for factor in (0, 1e4, -1e4):
         assert np.isfinite(LOSSES[name](factor * logits, labels, UNEQUAL))
         assert np.isfinite(GRADIENTS[name](factor * logits, labels, UNEQUAL)).all()
@@ -145,11 +154,11 @@ def test_losses_of_wild_logits_and_their_gradients_are_finite(name):
 def test_gradients_equal_finite_differences():
     """Of all losses at once, in float64."""
     with jax.enable_x64(True):
-        look = jax.jit(jax.value_and_grad(partial(total_loss, options=OPTIONS["all"])))
+        look = jax.jit(jax.value_and_grad(TERMS["all"]))
         weights, step = jnp.asarray(UNEQUAL, jnp.float64), 1e-6
         for seed in range(5):
             logits, labels = drawn(seed)
-            logits = logits.astype(np.float64)
+            logits, labels = logits.astype(np.float64), negating(labels, seed)
             direction = np.random.default_rng(seed).standard_normal(logits.shape)
             slope = (np.asarray(look(logits, labels, weights)[1]) * direction).sum()
             ahead, behind = (float(look(logits + sign * step * direction, labels, weights)[0]) for sign in (1, -1))
@@ -164,9 +173,25 @@ def test_the_weight_of_a_class_is_the_weight_of_its_pixels(seed):
     double = np.array([2, 1, 1], np.float32)
     again = labels == 0
     expected = reference_losses.cross_entropy(
-        np.concatenate([logits, logits[again]]).astype(np.float64), np.concatenate([labels, labels[again]]), EQUAL, 0.0
+        np.concatenate([logits, logits[again]]).astype(np.float64),
+        np.concatenate([labels, labels[again]]),
+        EQUAL,
+        0.0,
+        NEGATED,
     )
     assert LOSSES["cross_entropy"](logits, labels, double) == pytest.approx(expected, rel=1e-5, abs=1e-6)
+
+
+def test_any_other_class_is_as_good_as_the_true_one():
+    """Only the negated class loses, the one with what is known most of all; the others share the gain."""
+    labels = np.full(PIXELS, ANY_OTHER, np.uint8)
+    for index in range(CLASSES):
+        loss = LOSSES["cross_entropy"](certain(np.full(PIXELS, index, np.uint8)), labels, UNEQUAL)
+        assert loss == pytest.approx(100 - np.log(2) if index == NEGATED else 0, abs=1e-3)
+    slopes = np.asarray(GRADIENTS["cross_entropy"](np.zeros((PIXELS, CLASSES), np.float32), labels, UNEQUAL))
+    np.testing.assert_allclose(slopes * PIXELS, np.tile([-1 / 6, -1 / 6, 1 / 3], (PIXELS, 1)), rtol=1e-5)
+    agrees = np.asarray(correct(jnp.arange(CLASSES), labels[:CLASSES], NEGATED))
+    np.testing.assert_array_equal(agrees, np.arange(CLASSES) != NEGATED)
 
 
 def test_weights_of_classes():

@@ -201,13 +201,12 @@ def test_the_loss_of_a_step_is_that_of_its_examples(learning):
     draw = jax.jit(partial(augment, options=LEARNING.augmentation, fill=fill))
     keys = [jax.random.fold_in(jax.random.fold_in(augment_key, 0), place) for place in range(2)]
     drawn = [draw(key, *(array[place] for array in batch[:3]), jnp.array(False)) for place, key in enumerate(keys)]
-    crops, labels = zip(*drawn, strict=True)
-    loss, (logits, _) = jax.jit(learning.trainer.loss)(
-        learning.weights, jnp.stack(crops), jnp.stack(labels), dropout_key
-    )
+    crops = jax.tree.map(lambda *arrays: jnp.stack(arrays), *drawn)
+    labels = np.asarray(crops.labels)
+    loss, (logits, _) = jax.jit(learning.trainer.loss)(learning.weights, crops, dropout_key)
     _, info = learning.step(learning.init(), batch, key=5)
     assert float(info.loss) == pytest.approx(float(loss), rel=1e-3)
-    right = (np.asarray(logits).argmax(axis=-1) == np.array(labels))[np.array(labels) != 255]
+    right = (np.asarray(logits).argmax(axis=-1) == labels)[labels != 255]
     assert float(info.accuracy) == pytest.approx(right.mean(), abs=0.01)
 
 
