@@ -116,6 +116,9 @@ def frame_evidence(counts, free, params, rule) -> np.ndarray:
             amount, shares = points, here[:-1]
         elif rule.per_frame == "once":
             amount, shares = float(points > 0), (here[:-1] > 0).astype(float)
+        elif rule.per_frame == "majority":
+            ahead = [all(here[c] > here[other] for other in range(len(here)) if other != c) for c in range(class_count)]
+            amount, shares = float(points > 0), np.array(ahead, float)
         else:
             full = max(points, float(params.full_evidence_points))
             amount, shares = points / full, here[:-1] / full

@@ -18,10 +18,11 @@ DEFAULT_PRIORITY = ("rock",)
 class FusionRule:
     """The discrete choices of fusion, fixed when the step is compiled."""
 
-    per_frame: Literal["sum", "once", "mean"] = "mean"
+    per_frame: Literal["sum", "once", "majority", "mean"] = "mean"
     """How the points of a frame in a voxel count. sum: each adds its increment; once: each label that is present adds
-    its increment once; mean: the frame adds one increment, shared by the fractions of the labels, in full from
-    full_evidence_points on."""
+    its increment once; majority: the label of most points alone adds its increment, once; mean: the frame adds one
+    increment, shared by the fractions of the labels, in full from full_evidence_points on. Under once and majority
+    each point has its likeliest label."""
     carve: bool = True
     """Mark voxels that were seen through as free."""
     range_weighting: bool = True
@@ -31,6 +32,11 @@ class FusionRule:
     priority_classes: tuple[str, ...] | None = None
     """Classes that win a cell as soon as they pass class_threshold, in this order; the others compete by probability.
     By default rock, if it is a class."""
+
+    @property
+    def hard_labels(self) -> bool:
+        """Whether points have one label each, not probabilities: labels then pass no gradient."""
+        return self.per_frame in ("once", "majority")
 
     def priority(self, classes: Sequence[str]) -> list[int]:
         """Indices of the priority classes among `classes`, in their order."""

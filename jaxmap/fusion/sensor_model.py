@@ -63,6 +63,8 @@ def frame_evidence(
             amount, shares = points, counts[:-1]
         elif rule.per_frame == "once":
             amount, shares = (points > 0).astype(points.dtype), (counts[:-1] > 0).astype(points.dtype)
+        elif rule.per_frame == "majority":
+            amount, shares = (points > 0).astype(points.dtype), majority(counts)
         else:
             full = jnp.maximum(points, params.full_evidence_points)
             amount, shares = points / full, counts[:-1] / full
@@ -72,6 +74,19 @@ def frame_evidence(
             occupancy = occupancy + jnp.where(free & (points == 0), miss, 0.0)
         increments = params.class_increments - params.class_prior[None, :]
         return jnp.concatenate([occupancy[None], _mix_classes(increments, shares)])
+
+
+def majority(counts: Float[Array, "C1 X Y Z"]) -> Float[Array, "C X Y Z"]:
+    """1 for the class that weighs most in a voxel, 0 for all others.
+
+    To have no class is a label like any other: where it weighs most, or the greatest are equal, no class has a 1. So
+    the order of the classes is of no account.
+    """
+    rows = list(counts)
+    # Reduced over the leading axis like `total_weight`.
+    greatest = functools.reduce(jnp.maximum, rows)
+    ties = functools.reduce(operator.add, [(row == greatest).astype(counts.dtype) for row in rows])
+    return ((counts[:-1] == greatest) & (ties == 1)).astype(counts.dtype)
 
 
 def total_weight(counts: Float[Array, "C1 X Y Z"]) -> Float[Array, "X Y Z"]:

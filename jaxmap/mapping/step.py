@@ -104,7 +104,7 @@ def fuse_frame(
 
     cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
-    labels = harden(labels) if rule.per_frame == "once" else labels
+    labels = harden(labels) if rule.hard_labels else labels
     window = view_window(grid, camera, pose, depth_range_m[1], shape)
     free = None
     if rule.carve:

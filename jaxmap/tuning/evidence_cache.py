@@ -123,7 +123,7 @@ def tunable_numbers(labeller: Labeller, rule: FusionRule) -> Numbers:
 
 
 def _is_soft(labeller: Labeller, rule: FusionRule) -> bool:
-    return labeller.soft and rule.per_frame != "once"
+    return labeller.soft and not rule.hard_labels
 
 
 def _observer(recipe: CacheRecipe) -> Any:

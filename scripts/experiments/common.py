@@ -63,12 +63,13 @@ def command_line(text: str | None) -> argparse.ArgumentParser:
 
 
 class Traverse:
-    """A traverse in the simulator's layout: `sample:traverse`, or a folder that holds `Part1` and `gt`."""
+    """A traverse in the simulator's layout: `sample:traverse`, or a folder that holds `gt` and one part, as `Part1`."""
 
     def __init__(self, name: str | Path) -> None:
         self.folder = bundled("traverse") if str(name) == "sample:traverse" else Path(name)
         self.name = str(name) if str(name) == "sample:traverse" else self.folder.name
-        self.sequence = str(name) if str(name) == "sample:traverse" else str(self.folder / "Part1")
+        part = next(iter(sorted(self.folder.glob("Part*"))), self.folder / "Part1")
+        self.sequence = str(name) if str(name) == "sample:traverse" else str(part)
         self.gt = self.folder / "gt"
         self.truth = self.gt / "orthomosaic_labels.tif"
 
@@ -157,10 +158,10 @@ class Scored:
 
 
 def rules(base: MapConfig) -> dict[str, MapConfig]:
-    """The paper's rule, the majority of points in voxels of 0.2 m, and the default."""
-    paper = load_config("chiodini2020")
+    """Both readings of the paper's rule, the majority of points in voxels of 0.2 m, and the default."""
+    readings = {"paper": load_config("chiodini2020"), "hits only": load_config("chiodini2020_hits_only")}
     return {
-        "paper": replace(base, grid=paper.grid, fusion=paper.fusion),
+        **{name: replace(base, grid=reading.grid, fusion=reading.fusion) for name, reading in readings.items()},
         "majority": replace(base, grid=COARSE, fusion=POINTS),
         "default": base,
     }

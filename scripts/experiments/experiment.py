@@ -1,4 +1,4 @@
-"""The paper's experiment on simulated traverses: three drives, three sources of labels, three rules of fusion.
+"""The paper's experiment on simulated traverses: three drives, three sources of labels, four rules of fusion.
 
     python scripts/experiments/experiment.py --work DIR     # simulates the three first (extra `sim`), half an hour
     python scripts/experiments/experiment.py TRAVERSE... [--poses true]
@@ -31,7 +31,7 @@ def simulated(work: Path, scene: str, frames: int) -> Path:
 def main() -> None:
     """Simulates where asked, maps, scores, prints."""
     parser = command_line(__doc__)
-    parser.add_argument("traverses", nargs="*", type=Path, help="folders that hold Part1 and gt")
+    parser.add_argument("traverses", nargs="*", type=Path, help="folders that hold a part and gt")
     parser.add_argument("--work", type=Path, help="where to simulate the three traverses")
     parser.add_argument("--frames", type=int, default=14)
     parser.add_argument("--poses", choices=("own", "true"), default="own", help="estimated by the reader, or true")
@@ -40,7 +40,7 @@ def main() -> None:
     given = parse(parser)
     if bool(given.traverses) == bool(given.work):
         parser.error("give traverses or --work")
-    columns = {"traverse": "<14", "labels": "<9", "rule": "<9", **dict.fromkeys(SCORES, "10.3f")}
+    columns = {"traverse": "<16", "labels": "<9", "rule": "<10", **dict.fromkeys(SCORES, "10.3f")}
     columns |= {"mean IoU": "10.3f", "least": "7.3f", "greatest": "10.3f"}
     table = Table({**columns, "cells": "7d", "rock": "6d", "rocks": "7d", "frames": "8d"})
     for path in given.traverses or [simulated(given.work, scene, given.frames) for scene in SCENES]:

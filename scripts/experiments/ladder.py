@@ -1,4 +1,4 @@
-"""What each step of the fusion rule brings: one sequence with its labels, mapped under eight rules.
+"""What each step of the fusion rule brings: one sequence with its labels, mapped under nine rules.
 
     python scripts/experiments/ladder.py SEQUENCE TRUTH [--labels DIR --labels-are raw] [--crs EPSG:32631]
 
@@ -24,7 +24,8 @@ from jaxmap.runs.config import MapConfig
 
 def rungs(base: MapConfig) -> Iterator[tuple[str, MapConfig]]:
     """The rules, from the paper's to the default."""
-    yield "the paper: hit once", rules(base)["paper"]
+    yield "the paper, hits only", rules(base)["hits only"]
+    yield "the paper", rules(base)["paper"]
     yield "majority of points, 0.2 m", rules(base)["majority"]
     yield "... a vote for each frame", replace(base, grid=COARSE, fusion=FRAMES)
     yield "area: columns of 0.05 m, points", replace(base, grid=FINE, fusion=POINTS)

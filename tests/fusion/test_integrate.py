@@ -35,10 +35,9 @@ count = jax.jit(kernels.count_points, static_argnames="class_count")
 PARAMS = make_fusion_params(CLASSES)
 SUM = FusionRule("sum")
 CAMERA = dict(fx_px=30, cx_px=15.5, cy_px=11.5, baseline_m=0.2, width_px=32, height_px=24)
-PAPER = make_fusion_params(
-    CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_hit=0.9, class_miss=0.0, class_threshold=0.7
-)
-RULES = [FusionRule("sum"), FusionRule("once"), FusionRule("mean")]
+PAPER = make_fusion_params(CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_threshold=0.7)
+PAPER_RULE = FusionRule("majority", carve=False, range_weighting=False)
+RULES = [FusionRule("sum"), FusionRule("once"), FusionRule("majority"), FusionRule("mean")]
 
 
 def taken(labels: PointLabels, which) -> PointLabels:
@@ -178,16 +177,21 @@ def test_points_on_voxel_faces_fall_into_the_same_voxel_through_any_window():
         np.testing.assert_array_equal(windowed.log_odds, whole.log_odds)
 
 
-@given(rngs(), st.integers(1, POINTS))
-def test_paper_preset_adds_its_increment_once_however_many_points(rng, points_in_voxel):
+@given(rngs(), st.integers(1, POINTS), st.sampled_from([1, 2]))
+def test_paper_preset_adds_its_increment_once_however_many_points(rng, points_in_voxel, label):
     grid, voxel = make_grid([0, 0, 0], GRID_SHAPE, 1.0), (3, 2, 1)
     points = np.tile(np.array(voxel) + 0.5, (POINTS, 1)) + rng.uniform(-0.4, 0.4, (POINTS, 3))
-    labels = PointLabels(keep=jnp.arange(POINTS) < points_in_voxel, labels=jnp.full(POINTS, 2))
-    rule = FusionRule("once", carve=False, range_weighting=False, column="max")
-    after, _ = fuse(make_voxel_map(grid, CLASSES), points.astype(np.float32), labels, np.ones(POINTS), PAPER, rule)
+    # Fewer than half of the points have another label.
+    own = np.where(np.arange(POINTS) < (points_in_voxel - 1) // 2, 0, label)
+    labels = PointLabels(keep=jnp.arange(POINTS) < points_in_voxel, labels=jnp.asarray(own))
+    after, _ = fuse(
+        make_voxel_map(grid, CLASSES), points.astype(np.float32), labels, np.ones(POINTS), PAPER, PAPER_RULE
+    )
     log_odds = np.asarray(after.log_odds)
-    np.testing.assert_array_equal(log_odds[(slice(None), *voxel)], np.float32([0.9, 0.0, 0.0, 0.9]))
-    assert np.count_nonzero(log_odds) == 2
+    expected = np.full(4, -0.9, np.float32)
+    expected[[0, 1 + label]] = 0.9
+    np.testing.assert_array_equal(log_odds[(slice(None), *voxel)], expected)
+    assert np.count_nonzero(log_odds) == 4
 
 
 @given(grids(), rngs(), st.sampled_from(RULES))

@@ -16,10 +16,8 @@ from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labels import IGNORE
 from jaxmap.types import make_grid, make_voxel_map
 
-PAPER = make_fusion_params(
-    CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_hit=0.9, class_miss=0.0, class_threshold=0.7
-)
-PAPER_RULE = FusionRule("once", carve=False, range_weighting=False, column="max")
+PAPER = make_fusion_params(CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_threshold=0.7)
+PAPER_RULE = FusionRule("majority", carve=False, range_weighting=False)
 RULES = [FusionRule(), PAPER_RULE, FusionRule(priority_classes=()), FusionRule(priority_classes=("sand", "rock"))]
 
 
@@ -104,13 +102,16 @@ def test_geometry_alone_has_heights_and_no_labels(column):
     assert np.asarray(query.observed(voxel_map)).sum() == 3
 
 
-def test_one_hit_makes_a_rock_in_the_paper_preset_and_it_never_fades():
-    hit_once = map_of({(0, 0, 0): [0.9, 0, 0, 0.9]})
+def test_one_more_rock_than_sand_makes_a_cell_rock_in_the_paper_preset():
+    rock, sand = np.array([0.9, -0.9, -0.9, 0.9]), np.array([0.9, -0.9, 0.9, -0.9])
+    hit_once = map_of({(0, 0, 0): rock})
     assert query.voxel_labels(hit_once, PAPER, PAPER_RULE)[0, 0, 0] == 2
     assert query.top_down(hit_once, PAPER, PAPER_RULE).label[0, 0] == 2
     np.testing.assert_allclose(query.class_probabilities(hit_once, PAPER)[2, 0, 0, 0], 0.711, atol=5e-4)
-    sand_ever_after = map_of({(0, 0, 0): [90.0, 0, 89.1, 0.9]})
-    assert query.voxel_labels(sand_ever_after, PAPER, PAPER_RULE)[0, 0, 0] == 2
+    # In time, or up and down the column.
+    for seen in ({(0, 0, 0): rock + sand}, {(0, 0, 0): rock, (0, 0, 1): sand}):
+        assert query.top_down(map_of(seen), PAPER, PAPER_RULE).label[0, 0] != 2
+    assert query.top_down(map_of({(0, 0, 0): 2 * rock, (0, 0, 1): sand}), PAPER, PAPER_RULE).label[0, 0] == 2
 
 
 def test_the_threshold_decides_and_equal_is_not_enough():

@@ -16,7 +16,7 @@ from jaxmap.geometry.camera import depth_at_sigma, depth_sigma
 
 weight_of = jax.jit(sensor_model.range_weight)
 evidence_of = jax.jit(sensor_model.frame_evidence, static_argnames="rule")
-PER_FRAME = ["sum", "once", "mean"]
+PER_FRAME = ["sum", "once", "majority", "mean"]
 
 
 def random_counts(rng: np.random.Generator, classes: int) -> np.ndarray:
@@ -75,11 +75,26 @@ def test_mean_is_bounded_by_one_increment(rng):
     assert np.all(np.abs(evidence[1:]) <= 0.9 * (1 + 1e-6))
 
 
-@given(rngs(), st.integers(2, 1000))
-def test_once_does_not_depend_on_the_number_of_points(rng, factor):
+@given(rngs(), st.integers(2, 1000), st.sampled_from(["once", "majority"]))
+def test_once_and_majority_do_not_depend_on_the_number_of_points(rng, factor, per_frame):
     counts, params = random_counts(rng, 3), random_params(rng, CLASSES)
-    few, many = (evidence_of(c, None, params, FusionRule("once")) for c in (counts, counts * factor))
+    few, many = (evidence_of(c, None, params, FusionRule(per_frame)) for c in (counts, counts * factor))
     np.testing.assert_array_equal(few, many)
+
+
+@given(rngs())
+def test_the_majority_is_one_label_or_none_whatever_the_order_of_the_classes(rng):
+    counts, order = random_counts(rng, 3), rng.permutation(3)
+    chosen = np.asarray(sensor_model.majority(jnp.asarray(counts)))
+    assert set(np.unique(chosen)) <= {0.0, 1.0} and chosen.sum(axis=0).max() <= 1
+    others = np.asarray(sensor_model.majority(jnp.asarray(counts[[*order, 3]])))
+    np.testing.assert_array_equal(others, chosen[order])
+
+
+def test_the_majority_needs_more_points_than_any_other_label_and_than_no_label():
+    counts = np.array([[3, 2, 2, 0, 0.5], [2, 2, 0, 0, 0.75], [0, 1, 3, 0, 0.25]], np.float32).reshape(3, 5, 1, 1)
+    chosen = sensor_model.majority(jnp.asarray(counts))[..., 0, 0]
+    np.testing.assert_array_equal(chosen, [[1, 0, 0, 0, 0], [0, 0, 0, 0, 1]])
 
 
 def test_prior_is_taken_off_each_observation_as_the_standard_filter_does():

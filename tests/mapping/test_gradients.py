@@ -38,7 +38,7 @@ def soft_mapper(rule: FusionRule) -> Mapper:
 MAPPERS = {
     "own": soft_mapper(FusionRule()),
     "sum": soft_mapper(FusionRule("sum")),
-    "paper": soft_mapper(FusionRule("once", carve=False, range_weighting=False, column="max")),
+    "paper": soft_mapper(FusionRule("majority", carve=False, range_weighting=False)),
 }
 
 

@@ -35,7 +35,7 @@ PLANE_PARAMS = replace(PARAMS, labeller=PLANE.params)
 RULES = {
     "own": FusionRule(),
     "sum": FusionRule("sum"),
-    "paper": FusionRule("once", carve=False, range_weighting=False, column="max"),
+    "paper": FusionRule("majority", carve=False, range_weighting=False),
 }
 
 
@@ -255,7 +255,7 @@ def test_any_number_of_classes_goes_through_the_step(classes):
     assert np.asarray(view.observed).any()
 
 
-def test_soft_labels_are_hardened_where_points_count_once(mappers):
+def test_soft_labels_are_hardened_where_each_point_has_one_label(mappers):
     soft = make_mapper(CAMERA, GRID, make_files_labeller(CLASSES, soft=True), RULES["paper"], DEPTH_RANGE_M)
     hard = mappers["paper"]
     frame = an_example_frame(2)

@@ -43,11 +43,16 @@ def test_every_config_loads_and_is_read_to_the_last_key(path):
     assert path.read_text().startswith("#"), "says what it is"
 
 
-def test_there_is_a_config_for_the_paper():
-    fusion = load_config("chiodini2020").fusion
-    assert load_config("chiodini2020").grid.voxel_size_m == 0.2
-    assert (fusion.per_frame, fusion.carve, fusion.range_weighting, fusion.column) == ("once", False, False, "max")
-    assert (fusion.occupancy_hit, fusion.class_hit, fusion.class_miss, fusion.occupancy_miss) == (0.9, 0.9, 0.0, 0.0)
+@pytest.mark.parametrize(
+    ("name", "reading"),
+    [("chiodini2020", ("majority", "sum", -0.9)), ("chiodini2020_hits_only", ("once", "max", 0.0))],
+)
+def test_there_is_a_config_for_each_reading_of_the_paper(name, reading):
+    fusion = load_config(name).fusion
+    assert load_config(name).grid.voxel_size_m == 0.2
+    assert (fusion.per_frame, fusion.column, fusion.class_miss) == reading
+    assert (fusion.carve, fusion.range_weighting) == (False, False)
+    assert (fusion.occupancy_hit, fusion.class_hit, fusion.occupancy_miss) == (0.9, 0.9, 0.0)
     assert (fusion.class_prior, fusion.class_threshold) == (0.5, 0.7)
 
 
@@ -71,7 +76,7 @@ configs = st.builds(
     ),
     fusion=st.builds(
         FusionOptions,
-        per_frame=st.sampled_from(["sum", "once", "mean"]),
+        per_frame=st.sampled_from(["sum", "once", "majority", "mean"]),
         class_increments=st.none() | st.just(((1.0, -0.5), (-0.25, 0.5))),
         class_prior=st.floats(0.01, 0.99) | st.tuples(st.floats(0.01, 0.99), st.floats(0.01, 0.99)),
     ),
@@ -159,6 +164,6 @@ def test_yaml_runs_no_code(tmp_path):
 
 def test_the_params_of_a_config_are_what_it_says():
     made = make_fusion_params(("background", "sand", "rock"), load_config("chiodini2020").fusion)
-    np.testing.assert_allclose(made.class_increments, 0.9 * np.eye(3), atol=1e-7)
+    np.testing.assert_allclose(made.class_increments, 1.8 * np.eye(3) - 0.9, atol=1e-7)
     np.testing.assert_allclose(made.class_prior, 0, atol=1e-7)
     np.testing.assert_allclose(made.class_threshold, 0.7)

@@ -55,7 +55,7 @@ LABELLERS = {
 RULES = {
     "own": FusionRule(),
     "sum": FusionRule("sum", carve=False, range_weighting=False),
-    "paper": FusionRule("once", column="max"),
+    "paper": FusionRule("majority", range_weighting=False),
 }
 
 

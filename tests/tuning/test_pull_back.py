@@ -38,7 +38,7 @@ KEY = jax.random.key(3)
 RULES = {
     "own": FusionRule(),
     "sum": FusionRule("sum", carve=False),
-    "paper": FusionRule("once", carve=False, range_weighting=False, column="max"),
+    "paper": FusionRule("majority", carve=False, range_weighting=False),
 }
 MAPPERS = {
     name: make_mapper(CAMERA, GRID, make_files_labeller(ROVER_CLASSES, soft=True), rule, DEPTH_RANGE_M)
