@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmap.models.architecture import Architecture, Padding
-from jaxmap.models.convolutions import max_pool
+from jaxmap.models.bands import by_bands, rows_per_band
+from jaxmap.models.convolutions import Axis, convolve_rows, max_pool
 from jaxmap.models.layers import ConvBlock, SeparableBlock
 
 
@@ -54,6 +57,9 @@ LOW_LEVEL_UNIT = 2
 """The inverted residual whose output is the low-level feature: the last at stride 4, 24 channels."""
 
 TOP_CHANNELS = 1280
+
+HIDDEN_BYTES = 1 << 23
+"""Expanded images larger than this are made a few rows at a time: fresh memory costs more than rows made twice."""
 
 RESNET_UNITS = {"resnet18": (2, 2, 2, 2), "resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}
 """Units of each stage (He et al. 2015, table 1)."""
@@ -114,12 +120,42 @@ class InvertedResidual(nnx.Module):
         )
         self.project = ConvBlock(hidden, outputs, activation="none", **common)
         self.shortcut = stride == 1 and inputs == outputs
+        # Batch norms that learn need all pixels at once.
+        self.mergeable = expansion > 1 and not record.backbone_norm
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the unit."""
-        hidden = images if self.expand is None else self.expand(images)
-        result = self.project(self.depthwise(hidden))
+        if self.mergeable and jax.default_backend() == "cpu" and self._hidden_bytes(images) > HIDDEN_BYTES:
+            result = self._by_bands(images)
+        else:
+            hidden = images if self.expand is None else self.expand(images)
+            result = self.project(self.depthwise(hidden))
         return images + result if self.shortcut else result
+
+    def _hidden_bytes(self, images: Array) -> int:
+        return images[..., 0].size * self.depthwise.kernel.shape[3] * images.dtype.itemsize
+
+    def _by_bands(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
+        """The unit without its shortcut, a few rows at a time: the hidden image would not fit into the cache."""
+        expand, block, height = self.expand, self.depthwise, images.shape[1]
+        rows, columns = (
+            Axis.of(size, block.size, block.stride, block.dilation, block.padding) for size in images.shape[1:3]
+        )
+        band = rows_per_band(rows.outputs, self._hidden_bytes(images) * block.stride // height)
+        met = rows.reach(band)
+        after = max(rows.reach(rows.outputs) - height - rows.before, 0)
+        padded = jnp.pad(images, ((0, 0), (rows.before, after), (0, 0), (0, 0)))
+        axes = rows._replace(size=met, before=0, outputs=band), columns
+
+        def some(first: Int[Array, ""]) -> Array:
+            start = first * block.stride
+            hidden = expand(jax.lax.dynamic_slice_in_dim(padded, start, met, axis=1))
+            row = start + jnp.arange(met)[:, None, None] - rows.before
+            # Beyond the image lies no expanded zero, but zero.
+            hidden = jnp.where((row >= 0) & (row < height), hidden, 0)
+            return self.project(block.finish(convolve_rows(hidden, block.kernel[...], axes)))
+
+        return by_bands(some, rows.outputs, band)
 
 
 class InvertedResidualNet(nnx.Module):

@@ -53,6 +53,10 @@ class Axis(NamedTuple):
         count = (size + before + after - dilation * (kernel - 1) - 1) // stride + 1
         return cls(size, kernel, stride, dilation, before, count)
 
+    def reach(self, outputs: int) -> int:
+        """The pixels that so many neighbouring outputs meet, padding and all."""
+        return (outputs - 1) * self.stride + (self.kernel - 1) * self.dilation + 1
+
     def first(self, index: int) -> int:
         """The pixel that an element of the kernel meets at the first output; negative in the padding."""
         return index * self.dilation - self.before
@@ -124,6 +128,13 @@ def convolve(
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
         precision=PRECISION,
     )
+
+
+def convolve_rows(
+    images: Float[Array, "B H W C"], kernel: Float[Array, "K K 1 C"], axes: Axes
+) -> Float[Array, "B h w C"]:
+    """Depthwise convolution of some rows of an image, along given axes."""
+    return _depthwise(axes, images, kernel)
 
 
 def max_pool(
