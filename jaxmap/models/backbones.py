@@ -10,14 +10,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Architecture, Padding
-from jaxmap.models.bands import by_bands, rows_per_band
-from jaxmap.models.convolutions import Axis, convolve_rows, max_pool
-from jaxmap.models.layers import ConvBlock, SeparableBlock
+from jaxmap.models.convolutions import max_pool
+from jaxmap.models.layers import ConvBlock, SeparableBlock, apply_by_bands
 
 
 class Stage(NamedTuple):
@@ -120,42 +118,31 @@ class InvertedResidual(nnx.Module):
         )
         self.project = ConvBlock(hidden, outputs, activation="none", **common)
         self.shortcut = stride == 1 and inputs == outputs
-        # Batch norms that learn need all pixels at once.
-        self.mergeable = expansion > 1 and not record.backbone_norm
+        self.folded = not record.backbone_norm
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the unit."""
-        if self.mergeable and jax.default_backend() == "cpu" and self._hidden_bytes(images) > HIDDEN_BYTES:
-            result = self._by_bands(images)
+        if self.is_large(images.shape):
+            result = apply_by_bands(self.blocks, images)
         else:
-            hidden = images if self.expand is None else self.expand(images)
-            result = self.project(self.depthwise(hidden))
+            result = images
+            for block in self.blocks:
+                result = block(result)
         return images + result if self.shortcut else result
 
-    def _hidden_bytes(self, images: Array) -> int:
-        return images[..., 0].size * self.depthwise.kernel.shape[3] * images.dtype.itemsize
+    @property
+    def blocks(self) -> list[ConvBlock]:
+        """Its convolutions in their order."""
+        return [block for block in (self.expand, self.depthwise, self.project) if block is not None]
 
-    def _by_bands(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
-        """The unit without its shortcut, a few rows at a time: the hidden image would not fit into the cache."""
-        expand, block, height = self.expand, self.depthwise, images.shape[1]
-        rows, columns = (
-            Axis.of(size, block.size, block.stride, block.dilation, block.padding) for size in images.shape[1:3]
-        )
-        band = rows_per_band(rows.outputs, self._hidden_bytes(images) * block.stride // height)
-        met = rows.reach(band)
-        after = max(rows.reach(rows.outputs) - height - rows.before, 0)
-        padded = jnp.pad(images, ((0, 0), (rows.before, after), (0, 0), (0, 0)))
-        axes = rows._replace(size=met, before=0, outputs=band), columns
+    def is_large(self, shape: tuple[int, ...]) -> bool:
+        """Whether its hidden image is too large for the cache, and rows of it may be made at a time.
 
-        def some(first: Int[Array, ""]) -> Array:
-            start = first * block.stride
-            hidden = expand(jax.lax.dynamic_slice_in_dim(padded, start, met, axis=1))
-            row = start + jnp.arange(met)[:, None, None] - rows.before
-            # Beyond the image lies no expanded zero, but zero.
-            hidden = jnp.where((row >= 0) & (row < height), hidden, 0)
-            return self.project(block.finish(convolve_rows(hidden, block.kernel[...], axes)))
-
-        return by_bands(some, rows.outputs, band)
+        Batch norms that learn need all pixels at once.
+        """
+        batch, height, width, _ = shape
+        hidden_bytes = batch * height * width * self.depthwise.kernel.shape[3] * 4
+        return self.folded and hidden_bytes > HIDDEN_BYTES and jax.default_backend() == "cpu"
 
 
 class InvertedResidualNet(nnx.Module):
@@ -187,9 +174,14 @@ class InvertedResidualNet(nnx.Module):
 
     def __call__(self, images: Float[Array, "B H W 3"]) -> Features:
         """The features, and the low-level feature."""
-        images = self.stem(images)
+        first, second, *others = self.units
+        size = [self.stem.axis(length).outputs for length in images.shape[1:3]]
+        if second.is_large((images.shape[0], *size, 0)):
+            images = apply_by_bands([self.stem, *first.blocks, *second.blocks], images)
+        else:
+            images = second(first(self.stem(images)))
         low_level = images
-        for index, unit in enumerate(self.units):
+        for index, unit in enumerate(others, start=2):
             images = unit(images)
             if index == LOW_LEVEL_UNIT:
                 low_level = images

@@ -12,10 +12,11 @@ from flax import nnx
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.models import backbones
-from jaxmap.models.architecture import folded, torch_architecture
-from jaxmap.models.backbones import InvertedResidual
+from jaxmap.models import backbones, layers
+from jaxmap.models.architecture import Padding, folded, torch_architecture
+from jaxmap.models.backbones import InvertedResidual, InvertedResidualNet
 from jaxmap.models.bands import by_bands, rows_per_band
+from jaxmap.models.layers import ConvBlock, apply_by_bands
 
 
 def normal(seed: int, *shape: int) -> np.ndarray:
@@ -36,28 +37,52 @@ def test_bands_fill_the_rows_and_keep_to_the_limit(rows, row_bytes, limit):
     assert band == 1 or band * row_bytes <= limit
 
 
-# Outputs, stride, dilation, and size of the kernel; the first has a shortcut.
-BANDED = [(4, 1, 1, 3), (6, 2, 1, 3), (6, 2, 1, 5), (6, 1, 2, 5)]
+def test_blocks_by_bands_are_those_of_the_whole_image(monkeypatch):
+    def block(inputs: int, outputs: int, size: int = 1, padding: Padding = "same", **more) -> ConvBlock:
+        return ConvBlock(inputs, outputs, size, padding=padding, norm="bias", activation="relu6", **more)
 
+    def middle(size: int, **more) -> ConvBlock:
+        return block(4, 4, size, depthwise=True, **more)
 
-@pytest.mark.parametrize("padding", ["same", "torch"])
-def test_an_inverted_residual_by_bands_is_that_of_the_whole_image(padding, monkeypatch):
-    record = replace(folded(torch_architecture("mobilenet_v2", ["sand", "rock"])), padding=padding)
-    units = [
-        InvertedResidual(4, outputs, 2, stride, dilation, record, size) for outputs, stride, dilation, size in BANDED
+    chains = [
+        [block(4, 4), middle(5, dilation=2), block(4, 3)],
+        [block(4, 4), middle(5, stride=2, padding="torch")],
+        [block(4, 4, 3, stride=2), middle(3), block(4, 4), middle(3, stride=2), block(4, 3)],
     ]
-    for number, unit in enumerate(units):
-        _, state = nnx.split(unit)
-        for index, (_, variable) in enumerate(nnx.to_flat_state(state)):
-            variable.set_value(jnp.asarray(normal(10 * number + index, *variable.get_value().shape)))
-        nnx.update(unit, state)
+    for number, chain in enumerate(chains):
+        for place, one in enumerate(chain):
+            one.kernel[...] = normal(10 * number + place, *one.kernel.shape)
+            assert one.bias is not None
+            one.bias[...] = 1 + normal(10 * number + place, *one.bias.shape)
+    monkeypatch.setattr(layers, "rows_per_band", lambda rows, row_bytes: min(rows, 3))
 
+    @jax.jit
     def results(images):
-        return [unit(images) for unit in units]
+        whole = []
+        for chain in chains:
+            whole.append(images)
+            for one in chain:
+                whole[-1] = one(whole[-1])
+        return whole, [apply_by_bands(chain, images) for chain in chains]
 
-    images = jnp.asarray(normal(0, 2, 11, 8, 4))
-    whole = jax.jit(lambda images: results(images))(images)
-    monkeypatch.setattr(backbones, "HIDDEN_BYTES", 0)
-    monkeypatch.setattr(backbones, "rows_per_band", lambda rows, row_bytes: 4)
-    for ours, theirs in zip(jax.jit(results)(images), whole, strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    for expected, found in zip(*results(normal(0, 2, 11, 8, 4)), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_large_hidden_images_are_made_by_bands_where_norms_are_folded(monkeypatch):
+    record, calls = folded(torch_architecture("efficientnet_lite0", ["sand", "rock"])), []
+
+    def counted(blocks, images):
+        calls.append(len(blocks))
+        for block in blocks:
+            images = block(images)
+        return images
+
+    monkeypatch.setattr(backbones, "apply_by_bands", counted)
+
+    images = jax.ShapeDtypeStruct((1, 384, 512, 3), jnp.float32)
+    nnx.eval_shape(lambda images: InvertedResidualNet(record)(images), images)
+    assert calls == [6]
+    unit = InvertedResidual(24, 24, 6, 1, 1, record)
+    assert unit.is_large((1, 192, 256, 24)) and not unit.is_large((1, 96, 128, 24))
+    assert not InvertedResidual(24, 24, 6, 1, 1, replace(record, backbone_norm=True)).is_large((1, 192, 256, 24))
