@@ -56,6 +56,12 @@ def test_there_is_a_config_for_each_reading_of_the_paper(name, reading):
     assert (fusion.class_prior, fusion.class_threshold) == (0.5, 0.7)
 
 
+def test_the_preset_for_sand_doubles_the_penalties():
+    stereo = load_config("sand").stereo
+    usual = replace(stereo, p1=None, p2=None).penalties()
+    assert stereo.mode == "hh" and stereo.penalties() == tuple(2 * penalty for penalty in usual)
+
+
 configs = st.builds(
     MapConfig,
     labeller=st.sampled_from(["plane", "none"]),
