@@ -176,7 +176,8 @@ class TrainingFolder:
         facts = {
             **plan.data.facts(),
             "Examples": f"{plan.order.examples} fixed ones" if fixed else "drawn anew in each epoch",
-            "Network": f"DeepLabv3{'+' * record.decoder}, {record.backbone}, output stride {record.output_stride}",
+            "Network": f"DeepLabv3{'+' * record.decoder}, {record.backbone}, output stride {record.output_stride}"
+            + ", sees relief" * bool(record.relief_channels),
             "Initial weights": "random" if plan.init is None else plan.init.name,
             "Random parts": ", ".join(network.fresh) or "none",
             "Batch norm trained in": ", ".join(network.batch_norms) or "no part",

@@ -259,7 +259,8 @@ def describe_network(network: InitialNetwork) -> str:
     """One line on the network and its initial weights."""
     record, parameters = network.architecture, sum(jnp.size(weight) for weight in network.weights.values())
     return (
-        f"DeepLabv3{'+' * record.decoder} on {record.backbone}, {parameters / 1e6:.1f} million parameters, "
+        f"DeepLabv3{'+' * record.decoder} on {record.backbone}{' and relief' * bool(record.relief_channels)}, "
+        f"{parameters / 1e6:.1f} million parameters, "
         f"output stride {record.output_stride}; fresh: {', '.join(network.fresh) or 'nothing'}; "
         f"batch norm learns in: {', '.join(network.batch_norms) or 'nothing'}"
     )

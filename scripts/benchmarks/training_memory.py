@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from jaxmap.geometry.relief import RELIEF_CHANNELS
-from jaxmap.host.memory import peak_resident_mib
+from jaxmap.host.memory import peak_resident_mib, restart_with_lasting_memory
 from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainConfig
 from jaxmap.training.initial_network import make_initial_network
 from jaxmap.training.step import Batch, make_trainer
@@ -32,8 +32,11 @@ def main() -> None:
     parser.add_argument("--config", help="a configuration of jaxmap train")
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--pretrained", action="store_true", help="the backbone's batch norms are frozen")
+    parser.add_argument("--returned", action="store_true", help="freed memory goes back to the system")
     parser.add_argument("--option", action="append", default=[], metavar="SECTION.NAME=VALUE")
     given = parser.parse_args()
+    if not given.returned:
+        restart_with_lasting_memory()
     config = TRAIN_SETTINGS.load(given.config) if given.config else TrainConfig()
     for text in given.option:
         name, value = text.split("=", 1)
