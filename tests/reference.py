@@ -120,7 +120,7 @@ def frame_evidence(counts, free, params, rule) -> np.ndarray:
     """Paper eq. 3, voxel by voxel."""
     counts = f64(counts)
     class_count = len(counts) - 1
-    increments, prior = f64(params.class_increments), f64(params.class_prior)
+    increments = f64(params.class_increments)
     out = np.zeros_like(counts)
     for voxel in np.ndindex(counts.shape[1:]):
         here = counts[(slice(None), *voxel)]
@@ -140,7 +140,7 @@ def frame_evidence(counts, free, params, rule) -> np.ndarray:
             out[(0, *voxel)] += float(params.occupancy_miss) - float(params.occupancy_prior)
         for i in range(class_count):
             for j in range(class_count):
-                out[(1 + j, *voxel)] += shares[i] * (increments[i, j] - prior[j])
+                out[(1 + j, *voxel)] += shares[i] * increments[i, j]
     return out
 
 

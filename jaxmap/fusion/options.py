@@ -13,6 +13,8 @@ from jaxmap.host.settings import NotNegative, Positive, Probability, options
 from jaxmap.labels import ROVER_CLASSES
 
 DEFAULT_PRIORITY, DEFAULT_LEFT_OUT = ("rock",), ("background",)
+RARE, EVEN = 0.05, 0.5
+"""Priors of the priority classes, and of the others."""
 
 
 @options("fusion")
@@ -69,22 +71,23 @@ class FusionOptions(FusionRule):
     """Log-odds added to the occupancy of a voxel that was seen through."""
     occupancy_prior: Annotated[float, Probability] = 0.5
     """Probability that a voxel is occupied before anything was seen."""
-    class_hit: float = 0.9
+    class_hit: float = 2.0
     """Log-odds that an observed label adds to its class."""
-    class_miss: float = -0.9
+    class_miss: float = -2.0
     """Log-odds that an observed label adds to every other class."""
     class_increments: tuple[tuple[float, ...], ...] | None = None
     """The whole matrix, row: observed label, column: class; overrides class_hit and class_miss."""
-    class_prior: Annotated[float, Probability] | tuple[Annotated[float, Probability], ...] = 0.5
-    """Probability of a class before anything was seen; one number, or one per class."""
+    class_prior: Annotated[float, Probability] | tuple[Annotated[float, Probability], ...] | None = None
+    """Probability of a class before anything was seen; one number, or one per class. By default 0.05 for the priority
+    classes, which are rare, and 0.5 for the others."""
     disparity_sigma_px: Annotated[float, Positive] = 0.5
     """Standard deviation of disparity."""
     full_evidence_points: Annotated[float, Positive] = 8.0
     """Points from which on a frame counts in full (per_frame mean)."""
     occupancy_threshold: Annotated[float, Probability] = 0.5
     """A voxel is occupied above this probability."""
-    class_threshold: Annotated[float, Probability] = 0.5
-    """A priority class wins above this probability."""
+    class_threshold: Annotated[float, Probability] | None = None
+    """A priority class wins above this probability; by default above its prior, where more speaks for it than against."""
     class_kernel: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     """One odd square a class: how much of the evidence of neighbouring columns counts when the map is read; tune
     --kernel learns it."""
@@ -107,6 +110,20 @@ class FusionOptions(FusionRule):
         return FusionRule(
             **choices | {name: tuple(classes[index] for index in indices) for name, indices in chosen.items()}
         )
+
+    def priors(self, classes: Sequence[str]) -> Any:
+        """The prior of each class, or what stands for them."""
+        if self.class_prior is not None:
+            return self.class_prior
+        rare = self.priority(classes)
+        return [RARE if index in rare else EVEN for index in range(len(classes))]
+
+    def threshold(self, classes: Sequence[str], priors: Sequence[float]) -> float:
+        """The probability above which a priority class wins."""
+        if self.class_threshold is not None:
+            return self.class_threshold
+        # A hair above: where nothing was seen, rounding must not decide.
+        return next((1.001 * priors[index] for index in self.priority(classes)), EVEN)
 
     def numbers(self) -> dict[str, Any]:
         """All but the discrete choices, by name."""

@@ -59,7 +59,7 @@ def make_fusion_params(classes: Sequence[str], options: FusionOptions | None = N
     }
     numbers = replace(options or FusionOptions(), **changes)
     count = len(classes)
-    priors = np.asarray(numbers.class_prior, np.float64)
+    priors = np.asarray(numbers.priors(classes), np.float64)
     if priors.shape not in ((), (count,)):
         raise JaxmapError(
             f"class_prior is {numbers.class_prior}", where="fusion", fix="give one probability, or one per class"
@@ -82,10 +82,12 @@ def make_fusion_params(classes: Sequence[str], options: FusionOptions | None = N
             where="fusion",
             fix="give one kernel for each class, such as 3x3",
         )
+    priors = np.broadcast_to(priors, (count,))
     values = {one.name: getattr(numbers, one.name) for one in fields(FusionParams)} | {
         "occupancy_prior": logit(numbers.occupancy_prior),
         "class_increments": increments,
-        "class_prior": np.broadcast_to(logit(priors), (count,)),
+        "class_prior": logit(priors),
+        "class_threshold": numbers.threshold(classes, priors.tolist()),
         "class_kernel": kernel,
     }
     leaves: dict[str, Any] = {name: to_device(value, np.float32) for name, value in values.items() if value is not None}

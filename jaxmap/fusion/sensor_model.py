@@ -1,7 +1,8 @@
 """The inverse sensor model: what the points of one frame say about each voxel.
 
 All evidence is additive over frames. The filter is `l_j = l_{j-1} + logit p(m|z_j) - logit p(m)`
-(paper eq. 3 with the standard sign; both signs agree at the paper's prior of 0.5).
+(paper eq. 3 with the standard sign; both signs agree at the paper's prior of 0.5). The increments of classes are what an
+observation adds, the prior already taken away.
 """
 
 from __future__ import annotations
@@ -72,8 +73,7 @@ def frame_evidence(
         if free is not None:
             miss = params.occupancy_miss - params.occupancy_prior
             occupancy = occupancy + jnp.where(free & (points == 0), miss, 0.0)
-        increments = params.class_increments - params.class_prior[None, :]
-        return jnp.concatenate([occupancy[None], _mix_classes(increments, shares)])
+        return jnp.concatenate([occupancy[None], _mix_classes(params.class_increments, shares)])
 
 
 def majority(counts: Float[Array, "C1 X Y Z"]) -> Float[Array, "C X Y Z"]:
