@@ -49,7 +49,7 @@ class StereoOptions:
     least 100; 0 turns it off."""
     speckle_range_px: Annotated[int, NotNegative] = 2
     """Disparity step that ends a blob."""
-    edge_step_px: NotNegative = 1.5
+    edge_step_px: Annotated[float, NotNegative] = 1.5
     """Pixels near a greater step of disparity are dropped: there, blocks smear rocks over the ground behind them; 0 keeps
     them."""
     edge_window_px: Annotated[int, Positive] = 7
