@@ -248,32 +248,34 @@ def kernel_gradient(
 def kernel_gradient_by_rows(
     images: Float[Array, "B H W C"], cotangent: Float[Array, "B h w C"], *, axes: Axes
 ) -> Float[Array, "K K 1 C"]:
-    """The same, a few rows at a time, which stay in the cache for all elements, summed by matrix products."""
+    """The same, a few rows at a time, which stay in the cache, summed by matrix products.
+
+    A step is for one row of the kernel: with the whole kernel in each, programs took a minute longer to compile.
+    """
     rows, columns = axes
     batch, channels = images.shape[0], images.shape[3]
     most = _BLOCK // (columns.outputs * channels)
     several = max(n for n in range(1, batch + 1) if batch % n == 0 and (n == 1 or n <= most))
-    elements = [(row, column) for row in range(rows.kernel) for column in range(columns.kernel)]
+    meeting = [columns.meeting(column) for column in range(columns.kernel)]
 
     def rows_of(array: Array, image: Array, row: Array) -> Array:
         return jax.lax.dynamic_slice(array, (image, row, 0, 0), (several, 1, *array.shape[2:]))[:, 0]
 
-    def add_row(step: Array, totals: list[Array]) -> list[Array]:
-        image, row_out = step // rows.outputs * several, step % rows.outputs
-        back = rows_of(cotangent, image, row_out)
-        result = []
-        for total, (row, column) in zip(totals, elements, strict=True):
-            source = row_out * rows.stride + rows.first(row)
-            met, at = columns.meeting(column)
-            product = rows_of(images, image, source)[:, met] * back[:, at]
-            product = jax.lax.optimization_barrier(product).reshape(-1, channels)
-            part = jnp.dot(jnp.ones(len(product), product.dtype), product, precision=PRECISION)
-            result.append(total + jnp.where((source >= 0) & (source < rows.size), part, 0))
-        return result
+    def add_row(step: Array, total: Array) -> Array:
+        place, row = step // rows.kernel, step % rows.kernel
+        image, row_out = place // rows.outputs * several, place % rows.outputs
+        source = row_out * rows.stride + row * rows.dilation - rows.before
+        back, met_row = rows_of(cotangent, image, row_out), rows_of(images, image, source)
+        parts = []
+        for met, at in meeting:
+            product = jax.lax.optimization_barrier(met_row[:, met] * back[:, at]).reshape(-1, channels)
+            parts.append(jnp.dot(jnp.ones(len(product), product.dtype), product, precision=PRECISION))
+        inside = (source >= 0) & (source < rows.size)
+        return total.at[row].add(jnp.where(inside, jnp.stack(parts), 0))
 
-    zeros = [jnp.zeros(channels, cotangent.dtype)] * len(elements)
-    totals = jax.lax.fori_loop(0, batch // several * rows.outputs, add_row, zeros)
-    return jnp.stack(totals).reshape(rows.kernel, columns.kernel, 1, channels)
+    zeros = jnp.zeros((rows.kernel, columns.kernel, channels), cotangent.dtype)
+    steps = batch // several * rows.outputs * rows.kernel
+    return jax.lax.fori_loop(0, steps, add_row, zeros)[:, :, None]
 
 
 WINOGRAD_MIN_CHANNELS = 128

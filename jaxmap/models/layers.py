@@ -6,6 +6,7 @@ Kernels start as zeros, which `deeplab.initial_weights` or a file replaces.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -92,8 +93,15 @@ class ConvBlock(nnx.Module):
 def apply_by_bands(blocks: Sequence[ConvBlock], images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
     """Blocks one after the other, a few rows at a time, so that what lies between them stays in the cache.
 
-    Norms that learn need all pixels at once. Rows that two bands need are made twice.
+    Norms that learn need all pixels at once. Rows that two bands need are made twice. On the way back everything is
+    made anew, at once.
     """
+    return _by_bands(*nnx.split(nnx.List(blocks)), images)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _by_bands(graph: Any, state: Any, images: Array) -> Array:
+    blocks = nnx.merge(graph, state)
     places, size = [], images.shape[1:3]
     for block in blocks:
         places.append(tuple(block.axis(length) for length in size))
@@ -122,6 +130,22 @@ def apply_by_bands(blocks: Sequence[ConvBlock], images: Float[Array, "B H W I"])
         return result
 
     return by_bands(some, height, band)
+
+
+def _by_bands_forward(graph: Any, state: Any, images: Array) -> tuple[Array, tuple[Any, Array]]:
+    return _by_bands(graph, state, images), (state, images)
+
+
+def _by_bands_backward(graph: Any, residuals: tuple[Any, Array], cotangent: Array) -> tuple[Any, Array]:
+    def at_once(state: Any, images: Array) -> Array:
+        for block in nnx.merge(graph, state):
+            images = block(images)
+        return images
+
+    return jax.vjp(at_once, *residuals)[1](cotangent)
+
+
+_by_bands.defvjp(_by_bands_forward, _by_bands_backward)
 
 
 class _Rows(NamedTuple):

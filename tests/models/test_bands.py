@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -67,6 +68,28 @@ def test_blocks_by_bands_are_those_of_the_whole_image(monkeypatch):
 
     for expected, found in zip(*results(normal(0, 2, 11, 8, 4)), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_gradient_of_blocks_by_bands_is_that_of_the_whole_image(monkeypatch):
+    monkeypatch.setattr(layers, "rows_per_band", lambda rows, row_bytes: 3)
+    blocks = nnx.List([ConvBlock(2, 3, norm="bias"), ConvBlock(3, 3, 3, depthwise=True, norm="bias")])
+    for number, block in enumerate(blocks):
+        block.kernel[...] = normal(number, *block.kernel.shape)
+    graph, state = nnx.split(blocks)
+
+    def whole(blocks, images):
+        for block in blocks:
+            images = block(images)
+        return images
+
+    def loss(state, images, apply):
+        return jnp.sin(apply(nnx.merge(graph, state), images)).sum()
+
+    both = [jax.jit(jax.grad(partial(loss, apply=apply), argnums=(0, 1))) for apply in (whole, apply_by_bands)]
+    expected, found = (jax.tree.leaves(gradient(state, normal(5, 1, 7, 6, 2))) for gradient in both)
+    for one, other in zip(expected, found, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-5)
 
 
 def test_large_hidden_images_are_made_by_bands_where_norms_are_folded(monkeypatch):
