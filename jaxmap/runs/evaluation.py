@@ -216,8 +216,9 @@ def summary(scores: dict[str, Any]) -> str:
     """One line on what scores rest on."""
     frames = "" if scores["frames"] is None else f"{scores['frames']} frames, "
     within = "" if scores["max_range_m"] is None else f" within {scores['max_range_m']:g} m"
+    rocks = scores["rocks"]
     return (
         f"{frames}{scores['cells']:,} cells of {scores['cell_size_m']:g} m observed and labelled{within}, "
-        f"{scores['rock_cells']:,} of them {scores['class']}; {scores['rocks']['count']} rocks in view, "
-        f"{scores['rocks']['missed']} missed"
+        f"{scores['rock_cells']:,} of them {scores['class']}; {rocks['count'] - rocks['missed']} of {rocks['count']} "
+        f"rocks in view found (at least {rocks['found_share']:.0%} of their area called {scores['class']})"
     )
