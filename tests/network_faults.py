@@ -272,6 +272,23 @@ def resnet34(folder: Path) -> Path:
     return saved(folder, dict.fromkeys(names, np.zeros(1, np.float32)))
 
 
+def half_words(source: Path, *more: str) -> list[str]:
+    """The command line that makes a model file smaller."""
+    return [str(word) for word in ("weights", "half", source, "--out", source.parent / "out.safetensors", *more)]
+
+
+def too_large(folder: Path) -> Path:
+    weights = seeded_weights(SMALL)
+    weights["classifier.bias"] = weights["classifier.bias"] + 1e5
+    save_model(folder / "model.safetensors", SMALL, weights)
+    return folder / "model.safetensors"
+
+
+def truncated_half(folder: Path) -> Path:
+    save_model(folder / "model.safetensors", SMALL, seeded_weights(SMALL), half=True)
+    return cut(folder / "model.safetensors", 0.9)
+
+
 def our_own(folder: Path) -> Path:
     (folder / "model.safetensors").write_bytes(_model_bytes(folder))
     return folder / "model.safetensors"
@@ -303,6 +320,12 @@ IMPORT_FAULTS: dict[str, tuple[int, Callable[[Path], list[str]]]] = {
     "converted onto itself": (
         1,
         lambda folder: import_words(source := saved(folder, resnet18_state()), "--out", str(source)),
+    ),
+    "a model too large for half precision": (1, lambda folder: half_words(too_large(folder))),
+    "a model in half precision truncated": (1, lambda folder: half_words(truncated_half(folder))),
+    "a model halved onto itself": (
+        1,
+        lambda folder: half_words(source := our_own(folder), "--out", str(source)),
     ),
     "unknown word after weights": (2, lambda folder: ["weights", "export"]),
     "unknown public weights": (2, lambda folder: ["weights", "fetch", "vgg16", "--out", str(folder / "out")]),

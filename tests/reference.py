@@ -86,6 +86,19 @@ def voxel_centres(grid) -> np.ndarray:
     return f64(grid.origin_m) + (np.moveaxis(np.indices(grid.shape), 0, -1) + 0.5) * f64(grid.voxel_size_m)
 
 
+def kept(labels, left_out) -> np.ndarray:
+    """Which points are fused: those whose likeliest label, "no class" being one, is none of those left out."""
+    keep = np.array(labels.keep)
+    for n in range(len(keep)):
+        if labels.probabilities is None:
+            keep[n] &= int(labels.labels[n]) not in left_out
+        else:
+            shares = [*f64(labels.probabilities[n]), 1 - f64(labels.probabilities[n]).sum()]
+            best = max(share for index, share in enumerate(shares) if index not in left_out)
+            keep[n] &= all(shares[index] <= best for index in left_out)
+    return keep
+
+
 def count_points(grid, points_world, labels, weights, class_count: int) -> np.ndarray:
     counts = np.zeros((class_count + 1, *grid.shape))
     index, inside = world_to_voxel(grid, points_world)
@@ -281,13 +294,14 @@ class Stepped(NamedTuple):
     sure: np.ndarray
 
 
-def step(log_odds, grid, frame, camera, params, rule, depth_range_m, label) -> Stepped:
+def step(log_odds, grid, frame, camera, params, rule, depth_range_m, label, left_out=()) -> Stepped:
     """One frame into the map; `label` is `(points_world, valid) -> PointLabels`."""
     points_camera, valid = disparity_to_points(camera, frame.disparity_px)
     depth_m = points_camera[..., 2]
     in_range = (valid & (depth_m >= depth_range_m[0]) & (depth_m <= depth_range_m[1])).reshape(-1)
     points_world = transform_points(frame.T_world_camera, points_camera.reshape(-1, 3))
     labels = label(points_world, in_range)
+    labels = labels._replace(keep=kept(labels, left_out))
     weights = np.ones(depth_m.size)
     if rule.range_weighting:
         weights = range_weight(camera, grid, depth_m.reshape(-1), params)

@@ -10,8 +10,9 @@ from annotated_types import Le
 
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import NotNegative, Positive, Probability, options
+from jaxmap.labels import ROVER_CLASSES
 
-DEFAULT_PRIORITY = ("rock",)
+DEFAULT_PRIORITY, DEFAULT_LEFT_OUT = ("rock",), ("background",)
 
 
 @options("fusion")
@@ -32,6 +33,9 @@ class FusionRule:
     priority_classes: tuple[str, ...] | None = None
     """Classes that win a cell as soon as they pass class_threshold, in this order; the others compete by probability.
     By default rock, if it is a class."""
+    left_out_classes: tuple[str, ...] | None = None
+    """Points whose likeliest class is one of these make no voxels. By default background where sand and rock are
+    classes, too: there it is the sky and what lies beyond the ground. Name none to map it."""
 
     @property
     def hard_labels(self) -> bool:
@@ -41,6 +45,13 @@ class FusionRule:
     def priority(self, classes: Sequence[str]) -> list[int]:
         """Indices of the priority classes among `classes`, in their order."""
         names = DEFAULT_PRIORITY if self.priority_classes is None else self.priority_classes
+        return [classes.index(name) for name in names if name in classes]
+
+    def left_out(self, classes: Sequence[str]) -> list[int]:
+        """Indices of the classes among `classes` that make no voxels."""
+        names = self.left_out_classes
+        if names is None:
+            names = DEFAULT_LEFT_OUT if set(ROVER_CLASSES) <= set(classes) else ()
         return [classes.index(name) for name in names if name in classes]
 
     def target(self, classes: Sequence[str]) -> str | None:
@@ -82,17 +93,20 @@ class FusionOptions(FusionRule):
         """The discrete choices, for a map of these classes.
 
         Raises:
-            UsageError: a priority class is none of them.
+            UsageError: a class that is named is none of them.
         """
-        if unknown := [name for name in self.priority_classes or () if classes and name not in classes]:
-            raise UsageError(
-                f"{', '.join(unknown)} is not one of the classes {' '.join(classes)}",
-                where="fusion.priority_classes",
-                fix="name classes of the map, or none",
-            )
+        chosen = {"priority_classes": self.priority(classes), "left_out_classes": self.left_out(classes)}
+        for option in chosen:
+            if unknown := [name for name in getattr(self, option) or () if classes and name not in classes]:
+                raise UsageError(
+                    f"{', '.join(unknown)} is not one of the classes {' '.join(classes)}",
+                    where=f"fusion.{option}",
+                    fix="name classes of the map, or none",
+                )
         choices: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(FusionRule)}
-        choices["priority_classes"] = tuple(classes[index] for index in self.priority(classes))
-        return FusionRule(**choices)
+        return FusionRule(
+            **choices | {name: tuple(classes[index] for index in indices) for name, indices in chosen.items()}
+        )
 
     def numbers(self) -> dict[str, Any]:
         """All but the discrete choices, by name."""

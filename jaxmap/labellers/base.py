@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, Shaped
 
 from jaxmap.fusion.bijectors import Bijector
+from jaxmap.fusion.options import FusionRule
 from jaxmap.geometry.cloud import PointCloud
 from jaxmap.geometry.options import GroundOptions
 from jaxmap.labels import IGNORE
@@ -122,6 +125,29 @@ def labels_of(labeller: Labeller, features: PointFeatures, estimate: PyTree, num
         # They are never stored side by side: each scatter reads its own one.
         return PointLabels(keep, probabilities=jnp.stack(labels, axis=-1))
     return PointLabels(keep, labels=labels[0])
+
+
+def fusible(labels: PointLabels, classes: Sequence[str], rule: FusionRule) -> PointLabels:
+    """The labels as a rule fuses them: hard where it asks for that, and without the points of classes it leaves out.
+
+    A point is left out where one of these is likelier than all else, "no class" too: a rock's edge against the sky
+    stays. To weigh points by what is not left out would not do: however little remains, a voxel would be occupied.
+    """
+    labels = harden(labels) if rule.hard_labels else labels
+    left_out = rule.left_out(classes)
+    if not left_out:
+        return labels
+    if labels.probabilities is None:
+        assert labels.labels is not None
+        out = functools.reduce(operator.or_, [labels.labels == index for index in left_out])
+    else:
+        # Class by class: XLA does not vectorise over a short last axis.
+        shares = [labels.probabilities[:, index] for index in range(len(classes))]
+        rest = 1.0 - functools.reduce(operator.add, shares)
+        others = [share for index, share in enumerate(shares) if index not in left_out]
+        greatest = functools.reduce(jnp.maximum, others, rest)
+        out = functools.reduce(operator.or_, [shares[index] > greatest for index in left_out])
+    return labels._replace(keep=labels.keep & ~out)
 
 
 def make_no_labeller() -> Labeller:

@@ -23,7 +23,7 @@ from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
-from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, harden, label_points
+from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
 
@@ -104,7 +104,7 @@ def fuse_frame(
 
     cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
-    labels = harden(labels) if rule.hard_labels else labels
+    labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], shape)
     free = None
     if rule.carve:

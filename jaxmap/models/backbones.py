@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Architecture, Padding
 from jaxmap.models.convolutions import max_pool
-from jaxmap.models.layers import ConvBlock, SeparableBlock
+from jaxmap.models.layers import ConvBlock, SeparableBlock, apply_by_bands
 
 
 class Stage(NamedTuple):
@@ -54,6 +55,9 @@ LOW_LEVEL_UNIT = 2
 """The inverted residual whose output is the low-level feature: the last at stride 4, 24 channels."""
 
 TOP_CHANNELS = 1280
+
+HIDDEN_BYTES = 1 << 23
+"""Expanded images larger than this are made a few rows at a time: fresh memory costs more than rows made twice."""
 
 RESNET_UNITS = {"resnet18": (2, 2, 2, 2), "resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}
 """Units of each stage (He et al. 2015, table 1)."""
@@ -114,12 +118,31 @@ class InvertedResidual(nnx.Module):
         )
         self.project = ConvBlock(hidden, outputs, activation="none", **common)
         self.shortcut = stride == 1 and inputs == outputs
+        self.folded = not record.backbone_norm
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the unit."""
-        hidden = images if self.expand is None else self.expand(images)
-        result = self.project(self.depthwise(hidden))
+        if self.is_large(images.shape):
+            result = apply_by_bands(self.blocks, images)
+        else:
+            result = images
+            for block in self.blocks:
+                result = block(result)
         return images + result if self.shortcut else result
+
+    @property
+    def blocks(self) -> list[ConvBlock]:
+        """Its convolutions in their order."""
+        return [block for block in (self.expand, self.depthwise, self.project) if block is not None]
+
+    def is_large(self, shape: tuple[int, ...]) -> bool:
+        """Whether its hidden image is too large for the cache, and rows of it may be made at a time.
+
+        Batch norms that learn need all pixels at once.
+        """
+        batch, height, width, _ = shape
+        hidden_bytes = batch * height * width * self.depthwise.kernel.shape[3] * 4
+        return self.folded and hidden_bytes > HIDDEN_BYTES and jax.default_backend() == "cpu"
 
 
 class InvertedResidualNet(nnx.Module):
@@ -151,9 +174,14 @@ class InvertedResidualNet(nnx.Module):
 
     def __call__(self, images: Float[Array, "B H W 3"]) -> Features:
         """The features, and the low-level feature."""
-        images = self.stem(images)
+        first, second, *others = self.units
+        size = [self.stem.axis(length).outputs for length in images.shape[1:3]]
+        if second.is_large((images.shape[0], *size, 0)):
+            images = apply_by_bands([self.stem, *first.blocks, *second.blocks], images)
+        else:
+            images = second(first(self.stem(images)))
         low_level = images
-        for index, unit in enumerate(self.units):
+        for index, unit in enumerate(others, start=2):
             images = unit(images)
             if index == LOW_LEVEL_UNIT:
                 low_level = images

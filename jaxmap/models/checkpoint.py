@@ -46,18 +46,32 @@ class SavedModel(NamedTuple):
 
 
 def save_model(
-    path: str | PathLike[str], architecture: Architecture, weights: Mapping[str, object], *, holds: Holds = "network"
+    path: str | PathLike[str],
+    architecture: Architecture,
+    weights: Mapping[str, object],
+    *,
+    holds: Holds = "network",
+    half: bool = False,
 ) -> None:
     """Writes a model file atomically.
 
+    Args:
+        path: the file.
+        architecture: the network.
+        weights: its arrays by dotted path.
+        holds: whether that is all of them, or those of the backbone.
+        half: whether they are stored as float16, in half the space; `load_model` gives float32 either way.
+
     Raises:
-        JaxmapError: the weights are not those of the network, or writing failed.
+        JaxmapError: the weights are not those of the network or too large for float16, or writing failed.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
     arrays = {name: as_float32(np.asarray(value)) for name, value in weights.items()}
     check_weights(architecture, arrays, holds=holds, where=path)
+    if half:
+        arrays = _halved(arrays, path)
     fields = dataclasses.asdict(architecture)
     record = {
         "format_version": FORMAT_VERSION,
@@ -73,6 +87,18 @@ def save_model(
             # The library wraps the operating system's error.
             code = errno.ENOSPC if "os error 28" in str(error) else errno.EIO
             raise OSError(code, str(error)) from error
+
+
+def _halved(arrays: dict[str, np.ndarray], where: object) -> dict[str, np.ndarray]:
+    with np.errstate(over="ignore"):
+        halves = {name: value.astype(np.float16) for name, value in arrays.items()}
+    if lost := [name for name, value in halves.items() if not np.isfinite(value).all()]:
+        raise JaxmapError(
+            f"numbers beyond {np.finfo(np.float16).max:.0f}, too large for half precision: {shortened(lost)}",
+            where=where,
+            fix="keep the model in full precision",
+        )
+    return halves
 
 
 def load_model(path: str | PathLike[str]) -> SavedModel:

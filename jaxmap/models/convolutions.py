@@ -53,6 +53,10 @@ class Axis(NamedTuple):
         count = (size + before + after - dilation * (kernel - 1) - 1) // stride + 1
         return cls(size, kernel, stride, dilation, before, count)
 
+    def reach(self, outputs: int) -> int:
+        """The pixels that so many neighbouring outputs meet, padding and all."""
+        return (outputs - 1) * self.stride + (self.kernel - 1) * self.dilation + 1
+
     def first(self, index: int) -> int:
         """The pixel that an element of the kernel meets at the first output; negative in the padding."""
         return index * self.dilation - self.before
@@ -108,10 +112,17 @@ def convolve(
     depthwise: bool = False,
 ) -> Float[Array, "B h w O"]:
     """Convolution without bias; a depthwise kernel has G = 1 and as many outputs as inputs."""
-    size = kernel.shape[0]
+    return convolve_along(_axes(images, kernel.shape[0], stride, dilation, padding), images, kernel, depthwise)
+
+
+def convolve_along(
+    axes: Axes, images: Float[Array, "B H W I"], kernel: Float[Array, "K K G O"], depthwise: bool
+) -> Float[Array, "B h w O"]:
+    """The same along given axes."""
     if depthwise:
-        return _depthwise(_axes(images, size, stride, dilation, padding), images, kernel)
-    if size == 1:
+        return _depthwise(axes, images, kernel)
+    stride, dilation = axes[0].stride, axes[0].dilation
+    if kernel.shape[0] == 1:
         return _pointwise(images[:, ::stride, ::stride], kernel[0, 0])
     # Other products promote by themselves, as double precision needs.
     dtype = jnp.result_type(images, kernel)
@@ -119,7 +130,7 @@ def convolve(
         images.astype(dtype),
         kernel.astype(dtype),
         window_strides=(stride, stride),
-        padding=[pad_amounts(images.shape[axis], size, stride, dilation, padding) for axis in (1, 2)],
+        padding=[(axis.before, axis.reach(axis.outputs) - axis.size - axis.before) for axis in axes],
         rhs_dilation=(dilation, dilation),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
         precision=PRECISION,

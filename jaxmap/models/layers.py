@@ -5,16 +5,19 @@ Kernels start as zeros, which `deeplab.initial_weights` or a file replaces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmap.models.architecture import Activation, Norm, Padding
+from jaxmap.models.bands import by_bands, rows_per_band
 from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
-from jaxmap.models.convolutions import WINOGRAD_MIN_CHANNELS, convolve, convolve_winograd
+from jaxmap.models.convolutions import WINOGRAD_MIN_CHANNELS, Axis, convolve_along, convolve_winograd
 
 BATCH_NORM_MOMENTUM = 0.9
 """Weight of the old running statistics; 0.1 in torch, which gives that of the new ones."""
@@ -60,17 +63,16 @@ class ConvBlock(nnx.Module):
         """Applies the block."""
         kernel = self.kernel[...]
         if kernel.shape[0] != self.size:
-            images = convolve_winograd(images, kernel, self.dilation)
-        else:
-            images = convolve(
-                images,
-                kernel,
-                stride=self.stride,
-                dilation=self.dilation,
-                padding=self.padding,
-                depthwise=self.depthwise,
-            )
-        return self.finish(images)
+            return self.finish(convolve_winograd(images, kernel, self.dilation))
+        return self.along((self.axis(images.shape[1]), self.axis(images.shape[2])), images)
+
+    def axis(self, size: int) -> Axis:
+        """How the kernel slides along an axis of so many pixels."""
+        return Axis.of(size, self.size, self.stride, self.dilation, self.padding)
+
+    def along(self, axes: tuple[Axis, Axis], images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
+        """Applies the block along given axes of rows and columns."""
+        return self.finish(convolve_along(axes, images, self.kernel[...], self.depthwise))
 
     def finish(self, images: Float[Array, "B h w O"]) -> Float[Array, "B h w O"]:
         """Bias or norm, then the activation."""
@@ -85,6 +87,49 @@ class ConvBlock(nnx.Module):
         """Whether the kernel may be transformed, and the block becomes faster by it."""
         plain = self.size == 3 and self.stride == 1 and not self.depthwise
         return plain and min(self.kernel.shape[2:]) >= WINOGRAD_MIN_CHANNELS
+
+
+def apply_by_bands(blocks: Sequence[ConvBlock], images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
+    """Blocks one after the other, a few rows at a time, so that what lies between them stays in the cache.
+
+    Norms that learn need all pixels at once. Rows that two bands need are made twice.
+    """
+    places, size = [], images.shape[1:3]
+    for block in blocks:
+        places.append(tuple(block.axis(length) for length in size))
+        size = tuple(axis.outputs for axis in places[-1])
+    height = size[0]
+    row_bytes = [
+        images.shape[0] * rows.outputs * columns.outputs * block.kernel.shape[3] * images.dtype.itemsize // height
+        for block, (rows, columns) in zip(blocks, places, strict=True)
+    ]
+    # For each block the rows that it is given, at `first` of the result from row `first * step + offset` on.
+    given = [_Rows(rows_per_band(height, max(row_bytes)), 1, 0)]
+    for rows, _ in reversed(places):
+        many, step, offset = given[0]
+        given.insert(0, _Rows(rows.reach(many), step * rows.stride, offset * rows.stride - rows.before))
+    band, start = given[-1].many, given[0]
+    after = max((height - band) * start.step + start.offset + start.many - images.shape[1], 0)
+    padded = jnp.pad(images, ((0, 0), (-start.offset, after), (0, 0), (0, 0)))
+
+    def some(first: Int[Array, ""]) -> Array:
+        result = jax.lax.dynamic_slice_in_dim(padded, first * start.step, start.many, axis=1)
+        for block, (rows, columns), before, behind in zip(blocks, places, given, given[1:], strict=False):
+            result = block.along((rows._replace(size=before.many, before=0, outputs=behind.many), columns), result)
+            # Beyond the image the next block meets zeros, not what this one makes of zeros.
+            place = first * behind.step + behind.offset + jnp.arange(behind.many)[:, None, None]
+            result = jnp.where((place >= 0) & (place < rows.outputs), result, 0)
+        return result
+
+    return by_bands(some, height, band)
+
+
+class _Rows(NamedTuple):
+    """Rows of an image that a band of the result depends on: how many, rows between those of two results, first one."""
+
+    many: int
+    step: int
+    offset: int
 
 
 class SeparableBlock(nnx.Module):

@@ -286,7 +286,8 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
         grid=plan.grid,
         depth_range_m=plan.depth_range_m,
         params=plan.params.fusion,
-        rule=plan.rule,
+        # What the network calls background may be ground all the same: the orthomosaic must reach it.
+        rule=replace(plan.rule, left_out_classes=()),
         truths=truths,
         losses=_losses(config, counts, truths),
         anchor=config.map_truth.anchor,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.cache import cache_folder
-from jaxmap.models.checkpoint import save_model
+from jaxmap.models.checkpoint import load_model, save_model
 from jaxmap.models.importers import ImportedWeights, import_weights
 
 TIMEOUT_S = 60.0
@@ -89,11 +89,27 @@ def convert_file(
         JaxmapError: the source is of no known kind or does not fit, it would be overwritten, or
             writing failed.
     """
-    if out.exists() and source.exists() and out.samefile(source):
-        raise JaxmapError("the checkpoint would be overwritten", where=out, fix="choose another --out")
+    _check_apart(source, out)
     imported = import_weights(source, classes=classes, output_stride=output_stride)
     save_model(out, imported.architecture, imported.weights, holds=imported.holds)
     return imported
+
+
+def halve_file(source: Path, out: Path) -> None:
+    """Writes a model file again in half precision.
+
+    Raises:
+        JaxmapError: the source is no whole model file, holds numbers too large for half precision or would be
+            overwritten, or writing failed.
+    """
+    _check_apart(source, out)
+    saved = load_model(source)
+    save_model(out, saved.architecture, saved.weights, holds=saved.holds, half=True)
+
+
+def _check_apart(source: Path, out: Path) -> None:
+    if out.exists() and source.exists() and out.samefile(source):
+        raise JaxmapError("the source would be overwritten", where=out, fix="choose another --out")
 
 
 def fetch(name: str, *, mirror: str | None = None, notify: Callable[[str], None] = lambda line: None) -> Path:

@@ -12,6 +12,8 @@ from jaxmap.errors import FrameError, UsageError
 from jaxmap.host.settings import NotNegative, Positive, options
 
 _SUBPIXELS = 16
+_SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
+"""Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
 
 @options("stereo")
@@ -42,8 +44,9 @@ class StereoOptions:
     """Margin in per cent by which the best match must win."""
     left_right_max_diff_px: Annotated[int, Ge(-1)] = 1
     """Greatest difference in the left-right check; -1 turns it off."""
-    speckle_window: Annotated[int, NotNegative] = 100
-    """Blobs of at most so many pixels are dropped; 0 turns it off."""
+    speckle_window: Annotated[int, NotNegative] | None = None
+    """Blobs of at most so many pixels are dropped; by default an 800th of the image's (983 of 1024 x 768), and at
+    least 100; 0 turns it off."""
     speckle_range_px: Annotated[int, NotNegative] = 2
     """Disparity step that ends a blob."""
     pad_left: bool = True
@@ -99,9 +102,10 @@ class Matcher:
             sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
             raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
         left, right = _grey(left), _grey(right)
+        image_px = left.size
         pad = max(self.num_disparities + self.options.min_disparity_px, 0) if self.options.pad_left else 0
         left, right = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
-        raw = self._engine().compute(left, right)[:, pad:]
+        raw = self._engine(image_px).compute(left, right)[:, pad:]
         disparity_px = np.multiply(raw, np.float32(1 / _SUBPIXELS), dtype=np.float32)
         np.copyto(disparity_px, np.nan, where=raw < self.options.min_disparity_px * _SUBPIXELS)
         return disparity_px
@@ -115,7 +119,7 @@ class Matcher:
         other_way = np.isfinite(self(right, left)).mean()
         return bool(other_way > 0.2 and other_way > 1.4 * valid)
 
-    def _engine(self) -> Any:
+    def _engine(self, image_px: int) -> Any:
         # Imported here, so that the command line can read the options without OpenCV.
         import cv2
 
@@ -123,6 +127,9 @@ class Matcher:
         if not hasattr(self._local, "engine"):
             options, unchecked = self.options, self.options.left_right_max_diff_px < 0
             p1, p2 = options.penalties()
+            speckle_px = options.speckle_window
+            if speckle_px is None:
+                speckle_px = max(round(image_px * _SPECKLE_SHARE), _LEAST_SPECKLE_PX)
             mode = "SGBM_3WAY" if options.mode == "3way" else options.mode.upper()
             self._local.engine = cv2.StereoSGBM.create(
                 minDisparity=options.min_disparity_px,
@@ -134,7 +141,7 @@ class Matcher:
                 disp12MaxDiff=self.num_disparities + 1 if unchecked else options.left_right_max_diff_px,
                 preFilterCap=options.pre_filter_cap,
                 uniquenessRatio=options.uniqueness_ratio,
-                speckleWindowSize=options.speckle_window,
+                speckleWindowSize=speckle_px,
                 speckleRange=options.speckle_range_px,
                 mode=getattr(cv2, f"STEREO_SGBM_MODE_{mode}"),
             )

@@ -29,7 +29,7 @@ from jaxmap.fusion.sensor_model import frame_evidence, range_weight
 from jaxmap.geometry.camera import depth_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import flat_voxel_index, view_window, whole_window, window_shape
-from jaxmap.labellers.base import Labeller, Numbers, harden, labels_of
+from jaxmap.labellers.base import Labeller, Numbers, fusible, harden, labels_of
 from jaxmap.mapping.step import MapperParams
 from jaxmap.tuning.options import BLOCK_PX
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
@@ -146,6 +146,7 @@ def _observer(recipe: CacheRecipe) -> Any:
         features = labeller.features(frame, cloud, params.labeller, key)
         estimate = labeller.estimate(features.of_frame, params.labeller.numbers)
         labels = labels_of(labeller, features, estimate, params.labeller.numbers)
+        labels = fusible(labels, labeller.classes, recipe.rule)
         keep, of_frame = labels.keep, features.of_frame
         if _is_soft(labeller, recipe.rule):
             values = jnp.stack(features.map(lambda values: tuple(jnp.moveaxis(values, 1, 0))), axis=-1)

@@ -26,7 +26,7 @@ import jaxlie
 import numpy as np
 from common import SHARED, Frames, Scored, Table, Traverse, command_line, fuse, parse
 
-from jaxmap.datasets import open_sequence
+from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.images import read_index_image
 from jaxmap.datasets.samples import motorcycle_disparity
 from jaxmap.evaluation.geometry_scores import depth_consistency
@@ -35,7 +35,7 @@ from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.types import to_device
 
-RANGE_M, FRAMES_APART, BACKGROUND, ROCK = 12.0, 5, 0, 2
+RANGE_M, DRIVE_FRAMES, FRAMES_APART, BACKGROUND, ROCK = 12.0, 15, 5, 0, 2
 SCORES = ("valid", "off_1px", "off_2px", "rock_off_2px", "rock_valid", "floating", "agreeing", "iou", "mean_iou")
 
 
@@ -49,9 +49,9 @@ class Truth(NamedTuple):
 class Site:
     """Rectified pairs of a data set, which are matched by one setting after the other."""
 
-    def __init__(self, name: str, source: str) -> None:
+    def __init__(self, name: str, source: str, frames: int | None = None) -> None:
         self.name = name
-        self.sequence = open_sequence(source)
+        self.sequence = open_sequence(source, ReadOptions(stop=frames))
         self.front_end = StereoFrontEnd(self.sequence.camera, StereoOptions())
         self.pairs = [self.front_end(*self.sequence.read_pair(frame)) for frame in self.sequence.frames]
         self.chosen = list(range(len(self.pairs)))
@@ -202,7 +202,7 @@ def sites(data: Path, traverses: list[Path] | None, *, maps: bool) -> Iterator[S
     yield Motorcycle()
     for name, folder in (("KITTI 01", "kitti_odometry/sequences/01"), ("K10", "k10")):
         if (data / "realdata" / folder).is_dir():
-            yield Drive(name, str(data / "realdata" / folder))
+            yield Drive(name, str(data / "realdata" / folder), DRIVE_FRAMES)
         else:
             print(f"left out: there is no {folder}")
 

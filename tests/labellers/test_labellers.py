@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import reference
 from hypothesis import given
-from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, cloud_of, rngs
+from hypothesis import strategies as st
+from strategies import CLASSES, HEIGHT_PX, WIDTH_PX, cloud_of, hard_labels, rngs, soft_labels
 
 from jaxmap.errors import JaxmapError
-from jaxmap.labellers.base import Labeller, label_points, make_no_labeller
+from jaxmap.fusion.options import FusionOptions, FusionRule
+from jaxmap.labellers.base import Labeller, fusible, label_points, make_no_labeller
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller
 from jaxmap.labels import IGNORE
@@ -157,3 +159,23 @@ def test_a_wrong_plane_labeller_is_refused_in_one_line(options, says):
 def test_an_unknown_option_of_the_fit_is_refused_at_once():
     with pytest.raises((JaxmapError, TypeError), match="hypothesis_count"):
         make_plane_labeller(CLASSES, hypothesis_count=3)
+
+
+@given(rngs(), st.booleans(), st.sampled_from([None, (), ("sand",), ("background", "rock"), CLASSES]))
+def test_points_of_classes_that_are_left_out_are_not_fused(rng, soft, names):
+    labels, rule = (soft_labels if soft else hard_labels)(rng), FusionRule(left_out_classes=names)
+    fused = fusible(labels, CLASSES, rule)
+    left_out = [CLASSES.index(name) for name in (("background",) if names is None else names)]
+    np.testing.assert_array_equal(fused.keep, reference.kept(labels, left_out))
+    hard = fusible(labels, CLASSES, FusionRule("majority", left_out_classes=names))
+    assert hard.probabilities is None
+    np.testing.assert_array_equal(hard.keep, fused.keep)
+
+
+def test_background_is_left_out_where_the_ground_has_a_class_of_its_own():
+    assert FusionOptions().rule(("rock", "background", "sand")).left_out_classes == ("background",)
+    for classes in ((), ("sand", "rock"), ("background", "car", "person"), ("background", "rock")):
+        assert FusionOptions().rule(classes).left_out_classes == ()
+    assert FusionOptions(left_out_classes=()).rule(CLASSES).left_out_classes == ()
+    with pytest.raises(JaxmapError, match="sky is not one of the classes sand rock in fusion.left_out_classes"):
+        FusionOptions(left_out_classes=("sky",)).rule(("sand", "rock"))

@@ -19,6 +19,7 @@ from jaxmap.fusion.query import top_down
 from jaxmap.labellers.base import make_no_labeller
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.plane import make_plane_labeller
+from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.types import Frame, PointLabels, make_grid, make_stereo_camera
 
@@ -34,7 +35,7 @@ PLANE = make_plane_labeller(CLASSES, hypotheses=32, sample_points=256)
 PLANE_PARAMS = replace(PARAMS, labeller=PLANE.params)
 RULES = {
     "own": FusionRule(),
-    "sum": FusionRule("sum"),
+    "sum": FusionRule("sum", left_out_classes=()),
     "paper": FusionRule("majority", carve=False, range_weighting=False),
 }
 
@@ -55,7 +56,7 @@ def plane_mapper() -> Mapper:
 
 @pytest.fixture(scope="session")
 def wide_mapper() -> Mapper:
-    return files_mapper(FusionRule(), WIDE_GRID)
+    return files_mapper(FusionRule(left_out_classes=()), WIDE_GRID)
 
 
 @st.composite
@@ -95,12 +96,23 @@ def test_the_whole_step_equals_the_twin(mappers, frame, name):
         RULES[name],
         DEPTH_RANGE_M,
         lambda points, valid: PointLabels(keep=valid, labels=labels),
+        () if name == "sum" else (CLASSES.index("background"),),
     )
     assert expected.sure.mean() > 0.5
     ours = np.asarray(voxel_map.log_odds)
     np.testing.assert_allclose(ours[:, expected.sure], expected.log_odds[:, expected.sure], rtol=1e-4, atol=2e-4)
-    assert info.points_kept == info.points_in_range <= info.points_valid
+    assert info.points_kept <= info.points_in_range <= info.points_valid
+    assert (info.points_kept == info.points_in_range) == (name == "sum")
     assert voxel_map.frames_fused == 1
+
+
+def test_background_stays_a_class_of_the_image_and_makes_no_voxels(mappers):
+    frame, mapper = an_example_frame(0), mappers["own"]
+    sky = replace(frame, labels=jnp.zeros_like(frame.labels))
+    assert set(np.unique(mapper.label_image(sky, PARAMS, KEY, 0))) == {CLASSES.index("background"), IGNORE}
+    voxel_map, info = mapper.step(mapper.init(), sky, PARAMS, KEY)
+    assert info.points_kept == 0 and info.voxels_freed > 0
+    assert not np.asarray(voxel_map.log_odds[1:]).any() and (np.asarray(voxel_map.log_odds[0]) <= 0).all()
 
 
 @given(st.lists(frames(), min_size=2, max_size=3))

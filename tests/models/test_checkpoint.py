@@ -72,6 +72,27 @@ def test_a_model_comes_back(path, weights):
         np.testing.assert_array_equal(saved.weights[name], value)
 
 
+def test_half_a_file_holds_three_digits_of_each_number(tmp_path, path, weights):
+    half = tmp_path / "half.safetensors"
+    save_model(half, SMALL, weights, half=True)
+    assert half.stat().st_size < 0.55 * path.stat().st_size
+    saved = load_model(half)
+    assert saved.architecture == SMALL and all(value.dtype == np.float32 for value in saved.weights.values())
+    for name, value in weights.items():
+        np.testing.assert_allclose(saved.weights[name], value, rtol=1e-3, atol=1e-7)
+    content = half.read_bytes()
+    for share in (0.001, 0.5, 0.999):
+        half.write_bytes(content[: int(len(content) * share)])
+        assert "truncated" in refusal(half)
+
+
+def test_numbers_too_large_for_half_a_file_are_refused(tmp_path, weights):
+    changed = {**weights, "classifier.bias": np.asarray([1, 7e4], np.float32)}
+    with pytest.raises(JaxmapError, match="beyond 65504, too large for half precision: classifier.bias"):
+        save_model(tmp_path / "m.safetensors", SMALL, changed, half=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_record_is_plain_json(path):
     record = json.loads(header_of(path)[0]["__metadata__"]["jaxmap"])
     assert record["format_version"] == 1

@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 from flax import nnx
 from golden.seeded_weights import seeded_weights
-from hypothesis import given
-from hypothesis import strategies as st
 from jaxtyping import ArrayLike
 
 from jaxmap.models import heads
 from jaxmap.models.architecture import Architecture, torch_architecture
 from jaxmap.models.deeplab import fold_batch_norm, weight_shapes
-from jaxmap.models.heads import RELIEF_FEATURES, Decoder, by_bands, rows_per_band, separable_on_upsampled
+from jaxmap.models.heads import RELIEF_FEATURES, Decoder, separable_on_upsampled
 
 
 def normal(seed: int, *shape: int) -> np.ndarray:
@@ -67,20 +65,6 @@ def test_upsampling_after_the_products_is_upsampling_before(coarse_size, fine_si
     compiled = jax.jit(lambda *given: separable_on_upsampled(*given, jnp.abs, align_corners=align_corners))
     result = compiled(*arrays, *kernels)
     np.testing.assert_allclose(result, np.abs(slowly(*arrays, *kernels, align_corners)), atol=1e-4)
-
-
-@pytest.mark.parametrize(("rows", "band"), [(1, 1), (7, 7), (12, 4), (20, 6)])
-def test_bands_are_the_rows(rows, band):
-    image = jnp.asarray(normal(0, 2, rows, 3, 1))
-    result = by_bands(lambda first: 2 * jax.lax.dynamic_slice_in_dim(image, first, band, axis=1), rows, band)
-    np.testing.assert_array_equal(result, 2 * image)
-
-
-@given(rows=st.integers(1, 500), row_bytes=st.integers(1, 1 << 22), limit=st.integers(1, 1 << 22))
-def test_bands_fill_the_rows_and_keep_to_the_limit(rows, row_bytes, limit):
-    band = rows_per_band(rows, row_bytes, limit)
-    assert 1 <= band <= rows
-    assert band == 1 or band * row_bytes <= limit
 
 
 RECORD = replace(torch_architecture("resnet18", ["sand", "rock"]), head_channels=8, low_level_channels=4)

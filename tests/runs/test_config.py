@@ -147,7 +147,8 @@ def test_options_check_themselves_however_they_are_made():
     with pytest.raises(UsageError, match="oak is not one of the classes sand rock in fusion.priority_classes"):
         FusionOptions(priority_classes=("oak",)).rule(("sand", "rock"))
     assert FusionOptions().rule(("sand", "gravel")).priority_classes == ()
-    assert FusionOptions(per_frame="sum").rule(ROVER_CLASSES) == FusionRule("sum", priority_classes=("rock",))
+    chosen = {"priority_classes": ("rock",), "left_out_classes": ("background",)}
+    assert FusionOptions(per_frame="sum").rule(ROVER_CLASSES) == FusionRule("sum", **chosen)
 
 
 def test_a_file_may_hold_nothing(tmp_path):

@@ -92,6 +92,17 @@ def test_small_blobs_are_speckles():
     assert valid(with_filter) < 0.7 * valid(without)
 
 
+@pytest.mark.parametrize(("size", "window"), [((300, 400), 150), ((60, 80), 100)])
+def test_speckles_are_by_default_an_800th_of_the_image(size, window):
+    pair = np.random.default_rng(0).integers(0, 256, (2, *size), dtype=np.uint8)
+    options = dict(num_disparities=32, uniqueness_ratio=0, left_right_max_diff_px=-1)
+    by_default, same, smaller = (
+        Matcher(StereoOptions(**options, speckle_window=chosen), size[1])(*pair) for chosen in (None, window, 20)
+    )
+    np.testing.assert_array_equal(by_default, same)
+    assert valid(by_default) < valid(smaller)
+
+
 def test_padding_matches_the_leftmost_columns_too():
     padded, plain = matched(pad_left=True), matched(pad_left=False)
     assert padded.shape == plain.shape == (HEIGHT_PX, WIDTH_PX)

@@ -372,7 +372,7 @@ FAULTY_FILES = [
     (
         "masks/a.png",
         big,
-        "the mask is 20x13 px, the image 20x12 px in SET/masks/a.png; give masks of the images' own size",
+        "the mask is 20x13 px, the image 20x12 px in SET/masks/a.png; give each mask the size of its image",
     ),
     ("masks/a.png", junk, "not an image of a known format in SET/masks/a.png; replace the mask"),
     ("masks/a.png", empty, "not an image of a known format in SET/masks/a.png; replace the mask"),
@@ -413,7 +413,7 @@ def test_faulty_files_are_reported_together(folder) -> None:
         big(folder / f"masks/{name}.png")
     assert error_of(folder, validation_share=0) == (
         "the mask is 20x13 px, the image 20x12 px (and 2 more are faulty: c.png, d.png) in SET/masks/a.png; "
-        "give masks of the images' own size"
+        "give each mask the size of its image"
     )
 
 
