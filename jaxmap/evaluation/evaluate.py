@@ -25,7 +25,15 @@ from jaxmap.evaluation.cells import (
 )
 from jaxmap.evaluation.map_scores import confusion_scores, count_confusion, ranking_scores, reliability, score_cells
 from jaxmap.evaluation.options import ScoringOptions
-from jaxmap.evaluation.truth_cells import Alignment, TruthCells, cell_counts, register, samples_of, soft_iou, truth_cells
+from jaxmap.evaluation.truth_cells import (
+    Alignment,
+    TruthCells,
+    cell_counts,
+    register,
+    samples_of,
+    soft_iou,
+    truth_cells,
+)
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.types import GridSpec
 

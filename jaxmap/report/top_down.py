@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 INK, FAINT, CASING = "#23272e", "#8a8f98", "#ffffff"
 UNOBSERVED_COLOUR = (241, 240, 236)
 DPI = 150
-_MAP_PX, _LEFT_PX, _RIGHT_PX, _BELOW_PX = 1500, 150, 50, 130
+WHOLE_PX, HALF_PX = 1500, 800
+"""The longer side of a map that fills a page, and of one of two side by side: text keeps its size."""
+_LEFT_PX, _RIGHT_PX, _BELOW_PX = 150, 50, 130
 _TEXT, _SMALL = 12, 11
 
 _LIGHT_WORLD = np.array([-0.5, 0.5, 0.75]) / np.linalg.norm([-0.5, 0.5, 0.75])
@@ -77,8 +79,20 @@ class Sheet:
     georeferenced: bool = True
 
 
-def draw(sheet: Sheet, path: str | os.PathLike[str], overlay: Callable[[Axes], object] | None = None) -> None:
+def draw(
+    sheet: Sheet,
+    path: str | os.PathLike[str],
+    overlay: Callable[[Axes], object] | None = None,
+    *,
+    map_px: int = WHOLE_PX,
+) -> None:
     """Draws a sheet into a PNG, north up; cells are whole pixels where they are large enough.
+
+    Args:
+        sheet: what is drawn.
+        path: the picture.
+        overlay: draws more onto the map.
+        map_px: the longer side of the map.
 
     Raises:
         JaxmapError: the disk is full or refuses.
@@ -92,7 +106,7 @@ def draw(sheet: Sheet, path: str | os.PathLike[str], overlay: Callable[[Axes], o
     # Whole cells of margin, so that the edges of cells stay where they are.
     margin_m = np.ceil(np.maximum(0.04 * (high_m - low_m).max(), sheet.cell_m) / sheet.cell_m) * sheet.cell_m
     low_m, high_m = low_m - margin_m, high_m + margin_m
-    px_per_m = _MAP_PX / (high_m - low_m).max()
+    px_per_m = map_px / (high_m - low_m).max()
     if px_per_m * sheet.cell_m.min() > 2:
         px_per_m = np.floor(px_per_m * sheet.cell_m.min()) / sheet.cell_m.min()
     map_width, map_height = (max(1, round(span * px_per_m)) for span in high_m - low_m)
@@ -229,6 +243,7 @@ def top_down_picture(
     *,
     title: str = "",
     georeferenced: bool = True,
+    map_px: int = WHOLE_PX,
 ) -> None:
     """Draws the observed part of a top-down map into a PNG.
 
@@ -247,7 +262,8 @@ def top_down_picture(
         names = [*enumerate(classes), (IGNORE, "no label")]
         legend = [(name, colours[label]) for label, name in names if label in present]
     look: dict[str, Any] = dict(legend=[*legend, ("not observed", UNOBSERVED_COLOUR)], bar=bar, title=title)
-    draw(map_sheet(shown.colours, top, grid, trajectory_world, georeferenced=georeferenced, **look), path)
+    sheet = map_sheet(shown.colours, top, grid, trajectory_world, georeferenced=georeferenced, **look)
+    draw(sheet, path, map_px=map_px)
 
 
 class MapColours(NamedTuple):
