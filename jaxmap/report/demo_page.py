@@ -13,10 +13,11 @@ from jaxtyping import UInt8
 
 from jaxmap.evaluation.evaluate import Evaluation
 from jaxmap.fusion.query import TopDown, top_down
-from jaxmap.report.error_map import write_error_map, write_truth_map
+from jaxmap.labels import class_colours
+from jaxmap.report.error_map import verdict_colours, write_error_map, write_truth_map
 from jaxmap.report.page import figure, header, inline_image, section, table, write_page
 from jaxmap.report.run_page import RunContents, in_3d, key_frame_row, read_run
-from jaxmap.report.top_down import HALF_PX, map_sheet, top_down_picture
+from jaxmap.report.top_down import HALF, UNOBSERVED_COLOUR, map_sheet, top_down_picture
 
 Row = Mapping[str, Any]
 
@@ -49,25 +50,31 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
     shown = read_run(out / str(last.row["run"]))
     top: TopDown = jax.tree.map(np.asarray, top_down(shown.voxel_map, shown.params, shown.rule))
     box_m = map_sheet(np.zeros((0, 0, 3)), top, shown.voxel_map.grid, shown.trajectory_world, legend=()).box_m
-    look: dict[str, Any] = dict(box_m=box_m, map_px=HALF_PX)
+    look: dict[str, Any] = dict(box_m=box_m, layout=HALF)
     names = (shown.voxel_map.classes, shown.trajectory_world)
-    top_down_picture(top, shown.voxel_map.grid, *names, out / "map.png", map_px=HALF_PX)
+    top_down_picture(top, shown.voxel_map.grid, *names, out / "map.png", layout=HALF)
     write_truth_map(out / "truth.png", last.evaluation, last.backdrop, **look)
-    errors = ""
+    errors, verdicts = "", {}
     for run in runs:
         path, name = out / f"{run.row['run']}.png", str(run.row["map"])
         write_error_map(path, run.evaluation, run.backdrop, **look)
-        errors += _picture(path, f"Errors: {name}", _linked(run.row))
-    above = _picture(out / "map.png", "Top-down map", f"The map from above ({escape(str(last.row['map']))})")
+        errors += _picture(path, f"Errors: {name}", f"{_linked(run.row)}: IoU {_number(run.row['iou'])}")
+        verdicts |= verdict_colours(run.evaluation)
+    above = _picture(out / "map.png", "Top-down map", f"The map ({escape(str(last.row['map']))}) and the rover's path")
     above += _picture(out / "truth.png", "Ground truth", "Orthomosaic, at another time of day, with the true rocks")
+    classes = shown.voxel_map.classes
+    there = {name: class_colours(classes)[index] for index, name in enumerate(classes) if (top.label == index).any()}
     saw = key_frame_row(shown, next(iter(shown.pictures))) if shown.pictures else ""
     bodies = [
         _head(title, shown, last),
         section("What the rover saw", saw),
         in_3d(shown),
-        section("Map and ground truth", f'<div class="pairs">{above}</div>'),
+        section(
+            "Map and ground truth",
+            _legend(there | {"not observed": UNOBSERVED_COLOUR}) + f'<div class="pairs">{above}</div>',
+        ),
         section("Scores", f'<div class="tables"><figure>{_scores(columns, runs)}</figure></div>{_meaning(last.row)}'),
-        section("Where each map is right and wrong", f'<div class="pairs">{errors}</div>'),
+        section("Where each map is right and wrong", _legend(verdicts) + f'<div class="pairs">{errors}</div>'),
     ]
     return write_page(out / "report.html", title, "".join(bodies), drawn=len(shown.voxels.label) > 0)
 
@@ -100,6 +107,14 @@ def _meaning(row: Row) -> str:
         f"<p>Cells of {row['cell_size_m']:g} m within {reach_m:g} m of the camera. A rock is found where the map calls "
         f"at least {share:.0%} of its area in view rock. Frames/s: the whole pipeline, with stereo matching.</p>"
     )
+
+
+def _legend(colours: Mapping[str, Sequence[int]]) -> str:
+    entries = (
+        f'<span><i class="swatch" style="background:rgb({r},{g},{b})"></i>{escape(name)}</span>'
+        for name, (r, g, b) in colours.items()
+    )
+    return f'<p class="legend">{"".join(entries)}</p>'
 
 
 def _linked(row: Row) -> str:
