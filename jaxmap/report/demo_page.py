@@ -95,8 +95,15 @@ def _head(title: str, shown: RunContents, last: ScoredRun) -> str:
 
 
 def _scores(columns: Mapping[str, str], runs: Sequence[ScoredRun]) -> str:
+    """The table; the greatest number of a column is bold."""
     name, *keys = columns
-    rows = [(_linked(run.row), *(_number(run.row[key]) for key in keys)) for run in runs]
+    cells = [[_number(run.row[key]) for key in keys] for run in runs]
+    for column, key in enumerate(keys):
+        numbers = [run.row[key] if isinstance(run.row[key], float) else -np.inf for run in runs]
+        if max(numbers) > min(numbers):
+            best = cells[int(np.argmax(numbers))]
+            best[column] = f"<b>{best[column]}</b>"
+    rows = [(_linked(run.row), *row) for run, row in zip(runs, cells, strict=True)]
     return table([escape(columns[key]) for key in (name, *keys)], rows)
 
 
