@@ -2,8 +2,8 @@
 
     python scripts/readme_picture.py [RUN]
 
-RUN is a run of sample:traverse with the `OPTIONS` below; without it the traverse is mapped first, which takes a minute
-or two.
+RUN is a run of sample:traverse; without it the traverse is mapped first, as the last row of `jaxmap demo` but in cubes
+of `VOXEL_M`, which takes a minute.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +20,16 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
 import jaxmap as jm
+from jaxmap.commands.demo import SAMPLE, demo_rows
 from jaxmap.commands.main import main as jaxmap_main
 from jaxmap.datasets.samples import sample_truth
+from jaxmap.host.output_folder import write_yaml
 from jaxmap.labels import class_colours
 from jaxmap.report.run_page import RunContents, read_run
+from jaxmap.runs.config import config_tree
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "traverse.png"
-OPTIONS = "--labeller deeplab --depth.max-m 8 --grid.voxel-size-m 0.05 --stereo.mode hh4 --stereo.speckle-window 1000"
+VOXEL_M = 0.05
 FRAME = "000004"
 EYE_AZIMUTH_DEG, EYE_ELEVATION_DEG = -45.0, 33.0
 """Where the map is seen from in 3D: from behind the rover, east by north."""
@@ -35,9 +39,9 @@ INK, SIZE_PX, DPI = "#222222", (1800, 720), 100
 
 
 def voxels_in_3d(run: RunContents, width_px: int) -> Image.Image:
-    """The occupied voxels in parallel projection, far faces drawn first; background (the sky) is left out."""
+    """The occupied voxels in parallel projection, far faces drawn first."""
     labels = np.asarray(jm.voxel_labels(run.voxel_map, run.params, run.rule))
-    solid = (labels != jm.IGNORE) & (labels != run.voxel_map.classes.index("background"))
+    solid = labels != jm.IGNORE
     origin_m, size_m = np.asarray(run.voxel_map.grid.origin_m), np.asarray(run.voxel_map.grid.voxel_size_m)
     azimuth, elevation = np.deg2rad([EYE_AZIMUTH_DEG, EYE_ELEVATION_DEG])
     eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -81,7 +85,7 @@ def draw(run: RunContents) -> Figure:
         axes.set_axis_off()
         return axes
 
-    for top, kind, title in ((34, "left", "left image"), (392, "labels", "labels of the bundled DeepLabv3+")):
+    for top, kind, title in ((34, "left", "left image"), (392, "labels", "labels by DeepLabv3+ and relief")):
         axes = panel(12, top, 420, 316, title)
         axes.imshow(Image.open(run.path / "pictures" / f"{FRAME}_{kind}.png"), aspect="auto")
     title = "voxel map of 14 stereo pairs (sand, rock; white: not observed)"
@@ -116,7 +120,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = run or Path(name) / "run"
         if run is None:
-            jaxmap_main(["map", "sample:traverse", "--out", str(folder), *OPTIONS.split()])
+            _, config = demo_rows()["relief_deeplab"]
+            config = replace(config, grid=replace(config.grid, voxel_size_m=VOXEL_M))
+            write_yaml(Path(name) / "config.yaml", config_tree(config))
+            jaxmap_main(["map", SAMPLE, "--out", str(folder), "--config", str(Path(name) / "config.yaml")])
         draw(read_run(folder)).savefig(Path(name) / "picture.png")
         Image.open(Path(name) / "picture.png").convert("RGB").quantize(256).save(PICTURE, optimize=True)
     print(f"wrote {PICTURE}")

@@ -5,48 +5,59 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.geometry.options import DepthOptions
+from jaxmap.labellers.options import ReliefOptions
 from jaxmap.runs.config import MapConfig, load_config
+
+if TYPE_CHECKING:
+    from jaxmap.report.demo_page import ScoredRun
 
 SAMPLE = "sample:traverse"
 TITLE = "A simulated traverse, mapped and scored"
 MAX_RANGE_M = 8.0
 COLUMNS = {
-    "labeller": "labeller",
-    "preset": "preset",
+    "map": "map",
     "accuracy": "accuracy",
     "iou": "IoU",
     "precision": "precision",
     "recall": "recall",
-    "coverage": "coverage",
-    "frames_per_s": "frames/s",
-    "step_ms": "step, ms",
+    "found": "rocks found",
 }
+SIZES_M = {"under 0.2 m": (0.0, 0.2), "0.2 to 0.5 m": (0.2, 0.5), "over 0.5 m": (0.5, None)}
+"""Classes of rocks by diameter, on edges of `evaluation.evaluate.SIZE_EDGES_M`."""
 
 
 @dataclass(frozen=True)
 class DemoArguments:
-    """Map the bundled traverse with the DeepLabv3+ and the MLESAC labeller, and print the paper's table.
+    """Map the bundled traverse four times, and print the paper's table.
 
-    Each row of the table is a labeller under a preset, with a run folder of its own, scored against the traverse's
-    labelled orthomosaic in cells of 0.2 m, within 8 m of the camera.
+    The rows are the paper's two labellers (an MLESAC plane and DeepLabv3+) under its preset, and relief without and
+    with DeepLabv3+ under the default. Each has a run folder of its own, and is scored against the traverse's labelled
+    orthomosaic in cells of 0.2 m, within 8 m of the camera.
     """
 
     out: Path = Path("jaxmap_demo")
     """Folder to write; runs that lie in it are replaced."""
 
 
-def demo_rows() -> dict[str, tuple[str, str, MapConfig]]:
-    """The rows: run folder name, then labeller, preset and settings."""
-    rows = {}
-    for labeller in ("plane", "deeplab"):
-        for preset in ("chiodini2020", "default"):
-            config = MapConfig() if preset == "default" else load_config(preset)
-            config = replace(config, labeller=labeller, depth=DepthOptions(max_m=MAX_RANGE_M))
-            rows[f"{labeller}_{preset}"] = (labeller, preset, config)
-    return rows
+def demo_rows() -> dict[str, tuple[str, MapConfig]]:
+    """The rows: run folder name, then the name of the map and its settings."""
+    from jaxmap.host.files import bundled
+    from jaxmap.models.checkpoint import load_network
+
+    sees_relief = load_network(bundled("rover.safetensors")).architecture.relief_channels > 0
+    paper, ours = load_config("chiodini2020"), MapConfig()
+    both = replace(ours, labeller="deeplab", relief=ReliefOptions(combine=not sees_relief))
+    rows = {
+        "plane_chiodini2020": ("MLESAC plane (paper)", replace(paper, labeller="plane")),
+        "deeplab_chiodini2020": ("DeepLabv3+ (paper)", replace(paper, labeller="deeplab")),
+        "relief": ("relief", replace(ours, labeller="relief")),
+        "relief_deeplab": ("relief + DeepLabv3+", both),
+    }
+    return {run: (name, replace(config, depth=DepthOptions(max_m=MAX_RANGE_M))) for run, (name, config) in rows.items()}
 
 
 def main(words: Sequence[str]) -> int:
@@ -60,26 +71,28 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.runs.evaluation import summary
 
     keep_compiled_programs()
-    console = Console()
-    truth = sample_truth()
-    table = []
-    for name, (labeller, preset, config) in demo_rows().items():
-        console.notify(f"--- {labeller}, {preset} ---")
-        metrics, scores = _map_and_score(arguments.out / name, config, truth, console)
-        table.append({**scores, **_figures(metrics), "run": name, "labeller": labeller, "preset": preset})
+    console, truth = Console(), sample_truth()
+    runs = []
+    for run, (name, config) in demo_rows().items():
+        console.notify(f"--- {name} ---")
+        runs.append(_map_and_score(arguments.out / run, name, config, truth, console))
+    table = [dict(run.row) for run in runs]
+    sizes = {heading: heading for heading in SIZES_M if any(row[heading] for row in table)}
+    columns = COLUMNS | sizes | {"frames_per_s": "frames/s"}
     write_json(arguments.out / "table.json", table)
-    write_demo_page(arguments.out, TITLE, COLUMNS, table, truth)
-    console.table(TITLE, COLUMNS, table)
+    write_demo_page(arguments.out, TITLE, columns, runs)
+    console.table(TITLE, columns, table)
     console.notify(summary(table[-1]))
     console.result(arguments.out, ["report.html", "table.json", *(f"{row['run']}/" for row in table)])
     return 0
 
 
-def _map_and_score(out: Path, config: MapConfig, truth: Path, console: Console) -> tuple[dict, dict]:
+def _map_and_score(out: Path, name: str, config: MapConfig, truth: Path, console: Console) -> ScoredRun:
     """One row: a run and its scores, written into the run folder."""
     from jaxmap.evaluation.options import ScoringOptions
+    from jaxmap.report.demo_page import ScoredRun
     from jaxmap.report.run_page import write_report
-    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, write_evaluation
+    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, read_backdrop, write_evaluation
     from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.mapping import run_plan
     from jaxmap.runs.mapping_plan import plan_run
@@ -90,9 +103,25 @@ def _map_and_score(out: Path, config: MapConfig, truth: Path, console: Console) 
         folder.begin(plan.settings(config), resume=False, overwrite=True)
         metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify)
     evaluation, layer = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
-    write_evaluation(folder.scores, folder.errors, evaluation, layer, truth / "orthomosaic.tif")
+    backdrop = read_backdrop(truth / "orthomosaic.tif", evaluation, layer)
+    write_evaluation(folder.scores, folder.errors, evaluation, backdrop)
     write_report(out)
-    return metrics, evaluation.scores
+    row = {**evaluation.scores, **found_rocks(evaluation.scores["rocks"]), **_figures(metrics)}
+    return ScoredRun({**row, "run": out.name, "map": name}, evaluation, backdrop)
+
+
+def found_rocks(rocks: dict[str, Any]) -> dict[str, str | None]:
+    """How many of the rocks in view were found, in all (`found`) and by size; None where there are none."""
+
+    def share(rows: Sequence[dict[str, int]]) -> str | None:
+        count, missed = (sum(row[key] for row in rows) for key in ("count", "missed"))
+        return f"{count - missed} of {count}" if count else None
+
+    found = {"found": share([rocks])}
+    for heading, (low, high) in SIZES_M.items():
+        here = [row for row in rocks["by_diameter_m"] if row["from"] >= low and (high is None or row["from"] < high)]
+        found[heading] = share(here)
+    return found
 
 
 def _figures(metrics: dict) -> dict[str, float]:

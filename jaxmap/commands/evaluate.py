@@ -66,7 +66,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.datasets.rock_list import SIZE_CLASSES
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.report.run_page import write_report
-    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, summary, write_evaluation
+    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, read_backdrop, summary, write_evaluation
     from jaxmap.runs.folder import RunFolder
 
     keep_compiled_programs()
@@ -82,7 +82,8 @@ def main(words: Sequence[str]) -> int:
     truth = TruthOptions(arguments.target, coding, arguments.truth_crs, diameters_m)
     evaluation, layer = evaluate_run(arguments.run, arguments.ground_truth, truth, arguments.scoring)
     scores = evaluation.scores
-    write_evaluation(out, picture, evaluation, layer, arguments.backdrop)
+    backdrop = None if arguments.backdrop is None else read_backdrop(arguments.backdrop, evaluation, layer)
+    write_evaluation(out, picture, evaluation, backdrop)
     for note in scores["notes"]:
         console.notify(f"note: {note}")
     _print_scores(console, scores, summary(scores))

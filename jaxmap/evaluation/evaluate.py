@@ -25,7 +25,15 @@ from jaxmap.evaluation.cells import (
 )
 from jaxmap.evaluation.map_scores import confusion_scores, count_confusion, ranking_scores, reliability, score_cells
 from jaxmap.evaluation.options import ScoringOptions
-from jaxmap.evaluation.truth_cells import Alignment, TruthCells, cell_counts, register, soft_iou, truth_cells
+from jaxmap.evaluation.truth_cells import (
+    Alignment,
+    TruthCells,
+    cell_counts,
+    register,
+    samples_of,
+    soft_iou,
+    truth_cells,
+)
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.types import GridSpec
 
@@ -150,7 +158,10 @@ def evaluate_map(
         "cells": int(counted.sum()),
         "rock_cells": int((truly & counted).sum()),
         "frames": None if cameras is None else len(cameras.T_world_camera),
-        "rocks": rock_table(find_rocks(truth, cells.size_m, called, domain, range_m), options.found_share),
+        "rocks": rock_table(
+            find_rocks(truth, cells.size_m, _called_samples(layer, cells, truth.per_cell), domain, range_m),
+            options.found_share,
+        ),
         "cell_size_m": options.cell_size_m,
         "rock_fraction": options.rock_fraction,
         "max_range_m": options.max_range_m,
@@ -236,11 +247,22 @@ def _best_alignment(
     return best if iou(placed(best)) > iou(placed(still)) else still
 
 
+def _called_samples(layer: ClassLayer, cells: CellGrid, per_cell: int) -> Bool[np.ndarray, "FI FJ"]:
+    """Whether the map's own columns are of the class, at the samples of the truth; none is outside the map."""
+    origin_m, voxel_m = exact_corner(layer.grid)
+    place = []
+    for axis, columns in enumerate(layer.is_class.shape):
+        samples = (np.arange(cells.shape[axis] * per_cell) + 0.5) * cells.size_m / per_cell
+        column = np.floor((cells.origin_m[axis] + samples - origin_m[axis]) / voxel_m[axis])
+        place.append(column.clip(-1, columns).astype(int) + 1)
+    return np.pad(layer.is_class, 1)[np.ix_(*place)]
+
+
 class Rocks(NamedTuple):
     """Rocks of the truth that lie in the domain by half of their area at least.
 
     `diameter_m` is that of the disc of the same area; `range_m` how near a camera came to the nearest of their cells
-    (infinite where that is not known); `found_share` is how much of their area lies in cells called rock.
+    (infinite where that is not known); `found_share` is how much of their area in the domain the map calls rock.
     """
 
     diameter_m: Float64[np.ndarray, "N"]
@@ -251,7 +273,7 @@ class Rocks(NamedTuple):
 def find_rocks(
     truth: TruthCells,
     cell_size_m: float,
-    called: Bool[np.ndarray, "I J"],
+    called: Bool[np.ndarray, "FI FJ"],
     domain: Bool[np.ndarray, "I J"],
     range_m: Float[np.ndarray, "I J"],
 ) -> Rocks:
@@ -260,7 +282,8 @@ def find_rocks(
     Args:
         truth: in cells.
         cell_size_m: of a cell.
-        called: cells that the map calls rock.
+        called: samples of the truth that the map calls rock, by its columns: most stones are smaller than a cell, and
+            no map could find them by cells.
         domain: cells in which rocks count.
         range_m: how near a camera came to each cell (`view_range`).
     """
@@ -273,13 +296,12 @@ def find_rocks(
     for number, box in enumerate(find_objects(numbers), start=1):
         corner = tuple(slice(s.start // truth.per_cell, -(-s.stop // truth.per_cell)) for s in box)
         fine = tuple(slice(s.start * truth.per_cell, s.stop * truth.per_cell) for s in corner)
-        area = cell_counts(numbers[fine] == number, truth.per_cell)
-        inside = area * domain[corner]
-        if 2 * inside.sum() < area.sum():
+        rock = numbers[fine] == number
+        inside = rock & samples_of(domain[corner], truth.per_cell)
+        if 2 * inside.sum() < rock.sum():
             continue
-        share = (inside * called[corner]).sum() / inside.sum()
-        nearest_m = float(range_m[corner][(inside > 0)].min())
-        rows.append((2 * np.sqrt(area.sum() * sample_m2 / np.pi), nearest_m, share))
+        nearest_m = float(range_m[corner][cell_counts(inside, truth.per_cell) > 0].min())
+        rows.append((2 * np.sqrt(rock.sum() * sample_m2 / np.pi), nearest_m, called[fine][inside].mean()))
     table = np.array(rows, np.float64).reshape(-1, 3)
     return Rocks(table[:, 0], table[:, 1], table[:, 2])
 
@@ -287,7 +309,7 @@ def find_rocks(
 def rock_table(rocks: Rocks, found_share: float = 0.5) -> dict[str, Any]:
     """Counts of rocks and of missed rocks, in all, by size and by range.
 
-    A rock is found where at least `found_share` of its area lies in cells called rock.
+    A rock is found where the map calls at least `found_share` of its area in view rock.
     """
     found = rocks.found_share >= found_share - 1e-9
     return {

@@ -25,7 +25,7 @@ class ScoringOptions:
     register: bool = False
     """Shift (to 0.5 m) and turn (to 2 degrees) the truth to where it fits best; reported with the scores before."""
     found_share: float = 0.5
-    """A rock is found where this share of its area lies in cells called rock."""
+    """A rock is found where the map calls this share of its area in view rock, by its own columns."""
 
     def __post_init__(self) -> None:
         """Checks the bounds."""

@@ -1,119 +1,138 @@
-"""The page of `jaxmap demo`: input, scores, truth, maps and errors, and the last map in 3D."""
+"""The page of `jaxmap demo`: what the rover saw, the map in 3D and from above, the scores, and where each map errs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-import rasterio
-from PIL import Image
-from rasterio.coords import BoundingBox
-from rasterio.errors import RasterioError
-from rasterio.windows import from_bounds
+from jaxtyping import UInt8
 
-from jaxmap.errors import JaxmapError
-from jaxmap.host.files import atomic_path
-from jaxmap.labels import IGNORE, ROVER_CLASSES
+from jaxmap.evaluation.evaluate import Evaluation
+from jaxmap.fusion.query import TopDown, top_down
+from jaxmap.labels import class_colours
+from jaxmap.report.error_map import verdict_colours, write_error_map, write_truth_map
 from jaxmap.report.page import figure, header, inline_image, section, table, write_page
-from jaxmap.report.pictures import overlay_labels
-from jaxmap.report.run_page import in_3d, key_frame_row, read_run
-from jaxmap.report.wording import value_text
+from jaxmap.report.run_page import RunContents, in_3d, key_frame_row, read_run
+from jaxmap.report.top_down import HALF, UNOBSERVED_COLOUR, map_sheet, top_down_picture
 
-_WIDTH_PX = 1000
-
-Row = Mapping[str, object]
+Row = Mapping[str, Any]
 
 
-def write_demo_page(out: Path, title: str, columns: Mapping[str, str], rows: Sequence[Row], truth: Path) -> Path:
-    """Writes `OUT/report.html` from the run folders that the rows name, and returns its path.
+class ScoredRun(NamedTuple):
+    """A row of the table.
+
+    `row` holds the scores with `run`, the folder, and `map`, the name; `backdrop` is the orthomosaic on the cells of
+    the evaluation.
+    """
+
+    row: Row
+    evaluation: Evaluation
+    backdrop: UInt8[np.ndarray, "BI BJ 3"]
+
+
+def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Sequence[ScoredRun]) -> Path:
+    """Writes `OUT/report.html` with its pictures, and returns its path.
 
     Args:
-        out: the folder of the demo.
+        out: the folder of the demo, in which the runs lie.
         title: what was mapped.
         columns: heading of each key of the rows that is shown.
-        rows: one for each run; `run` is its folder, the last one is shown in 3D with its key frame.
-        truth: folder of orthomosaic.tif and orthomosaic_labels.tif.
+        runs: the last one is shown in 3D with its key frame.
 
     Raises:
         JaxmapError: a run is missing or broken, or the page cannot be written.
     """
-    shown = read_run(out / str(rows[-1]["run"]))
-    lead = (
-        f"{int(shown.voxel_map.frames_fused)} stereo frames of a simulated beach become a 3D semantic voxel map, with "
-        "two labellers (a fitted plane and a network) under two presets (the paper's and jaxmap's). Each top-down map "
-        "is scored against the labelled orthomosaic."
-    )
-    text = [key for key in columns if isinstance(rows[0][key], str)]
-    heading = " / ".join(columns[key] for key in text)
-    numbers = [key for key in columns if key not in text]
-    cells = [(_name(row), *(_score_text(row[key]) for key in numbers)) for row in rows]
-    scores = table((heading, *(escape(columns[key]) for key in numbers)), cells)
+    last = runs[-1]
+    shown = read_run(out / str(last.row["run"]))
+    top: TopDown = jax.tree.map(np.asarray, top_down(shown.voxel_map, shown.params, shown.rule))
+    box_m = map_sheet(np.zeros((0, 0, 3)), top, shown.voxel_map.grid, shown.trajectory_world, legend=()).box_m
+    look: dict[str, Any] = dict(box_m=box_m, layout=HALF)
+    names = (shown.voxel_map.classes, shown.trajectory_world)
+    top_down_picture(top, shown.voxel_map.grid, *names, out / "map.png", layout=HALF)
+    write_truth_map(out / "truth.png", last.evaluation, last.backdrop, **look)
+    errors, verdicts = "", {}
+    for run in runs:
+        path, name = out / f"{run.row['run']}.png", str(run.row["map"])
+        write_error_map(path, run.evaluation, run.backdrop, **look)
+        errors += _picture(path, f"Errors: {name}", f"{_linked(run.row)}: IoU {_number(run.row['iou'])}")
+        verdicts |= verdict_colours(run.evaluation)
+    above = _picture(out / "map.png", "Top-down map", f"The map ({escape(str(last.row['map']))}) and the rover's path")
+    above += _picture(out / "truth.png", "Ground truth", "Orthomosaic, at another time of day, with the true rocks")
+    classes = shown.voxel_map.classes
+    there = {name: class_colours(classes)[index] for index, name in enumerate(classes) if (top.label == index).any()}
+    saw = key_frame_row(shown, next(iter(shown.pictures))) if shown.pictures else ""
     bodies = [
-        header("jaxmap demo", title, lead),
-        section(
-            "Input, disparity and labels", key_frame_row(shown, next(iter(shown.pictures))) if shown.pictures else ""
-        ),
-        section("Scores", f'<div class="tables"><figure>{scores}</figure></div>'),
-        section("Ground truth", _truth(out, shown.path, truth)),
-        section(
-            "Top-down maps and their errors",
-            f'<div class="frames">{"".join(_map_and_errors(out, row) for row in reversed(rows))}</div>',
-        ),
+        _head(title, shown, last),
+        section("What the rover saw", saw),
         in_3d(shown),
+        section(
+            "Map and ground truth",
+            _legend(there | {"not observed": UNOBSERVED_COLOUR}) + f'<div class="pairs">{above}</div>',
+        ),
+        section("Scores", f'<div class="tables"><figure>{_scores(columns, runs)}</figure></div>{_meaning(last.row)}'),
+        section("Where each map is right and wrong", _legend(verdicts) + f'<div class="pairs">{errors}</div>'),
     ]
     return write_page(out / "report.html", title, "".join(bodies), drawn=len(shown.voxels.label) > 0)
 
 
-def _name(row: Row) -> str:
-    name = escape(f"{row['labeller']}, {row['preset']}")
-    return f'<a href="{escape(str(row["run"]))}/report.html">{name}</a>'
-
-
-def _score_text(value: object) -> str:
-    if not isinstance(value, float):
-        return value_text(value)
-    return f"{value:.3f}" if value < 10 else value_text(round(value))
-
-
-def _truth(out: Path, run: Path, truth: Path) -> str:
-    """The orthomosaic where the map lies, without and with its labels, as files of their own and in the page."""
-    with rasterio.open(run / "bev.tif") as raster:
-        bounds = raster.bounds
-    image = np.moveaxis(_cut(truth / "orthomosaic.tif", bounds), 0, -1)
-    codes = _cut(truth / "orthomosaic_labels.tif", bounds)[0]
-    labels = np.where(codes == 0, IGNORE, codes).astype(np.uint8)
-    pictures = {
-        "orthomosaic": ("Orthomosaic, at another time of day", image),
-        "truth": ("Ground truth", overlay_labels(image, labels, ROVER_CLASSES)),
-    }
-    figures = ""
-    for name, (caption, picture) in pictures.items():
-        with atomic_path(out / f"{name}.png") as temporary:
-            Image.fromarray(picture).save(temporary)
-        figures += figure(inline_image(out / f"{name}.png", caption, width_px=_WIDTH_PX), caption)
-    return f'<div class="row">{figures}</div>'
-
-
-def _cut(path: Path, bounds: BoundingBox) -> np.ndarray:
-    """The part of a raster that lies within bounds of its system: (bands, H, W)."""
-    try:
-        with rasterio.open(path) as file:
-            whole = from_bounds(*file.bounds, transform=file.transform)
-            part = from_bounds(*bounds, transform=file.transform).round_offsets().round_lengths()
-            return file.read(window=part.intersection(whole.round_offsets().round_lengths()))
-    except RasterioError as error:
-        raise JaxmapError("not a readable raster", where=path, fix="reinstall jaxmap") from error
-
-
-def _map_and_errors(out: Path, row: Row) -> str:
-    name = f"{row['labeller']}, {row['preset']}"
-    images = (
-        inline_image(out / str(row["run"]) / file, f"{kind}: {name}", width_px=_WIDTH_PX)
-        for file, kind in (("bev.png", "Top-down map"), ("errors.png", "Errors"))
+def _head(title: str, shown: RunContents, last: ScoredRun) -> str:
+    lead = (
+        f"{int(shown.voxel_map.frames_fused)} stereo frames and the rover's poses become a 3D semantic voxel map: by "
+        "the two labellers of Chiodini et al. (2020) under their fusion rule, and by jaxmap's own. Each map is scored "
+        "against a labelled orthomosaic."
     )
-    figures = "".join(f'<figure><div class="paper">{image}</div></figure>' for image in images)
+    row = last.row
+    stats: list[tuple[str, str | None]] = [
+        *((f"{key} of rock", _number(row[key.lower()])) for key in ("IoU", "Precision", "Recall")),
+        ("rocks found", str(row["found"])),
+        ("frames/s", _number(row["frames_per_s"])),
+    ]
+    return header("jaxmap demo", title, lead, stats)
+
+
+def _scores(columns: Mapping[str, str], runs: Sequence[ScoredRun]) -> str:
+    """The table; the greatest number of a column is bold."""
+    name, *keys = columns
+    cells = [[_number(run.row[key]) for key in keys] for run in runs]
+    for column, key in enumerate(keys):
+        numbers = [run.row[key] if isinstance(run.row[key], float) else -np.inf for run in runs]
+        if max(numbers) > min(numbers):
+            best = cells[int(np.argmax(numbers))]
+            best[column] = f"<b>{best[column]}</b>"
+    rows = [(_linked(run.row), *row) for run, row in zip(runs, cells, strict=True)]
+    return table([escape(columns[key]) for key in (name, *keys)], rows)
+
+
+def _meaning(row: Row) -> str:
+    """What the figures of the table mean."""
+    share, reach_m = row["rocks"]["found_share"], row["max_range_m"] or row["view_range_m"]
     return (
-        f'<div class="frame"><h3>{_name(row)}: IoU {_score_text(row["iou"])}</h3><div class="row">{figures}</div></div>'
+        f"<p>Cells of {row['cell_size_m']:g} m within {reach_m:g} m of the camera. A rock is found where the map calls "
+        f"at least {share:.0%} of its area in view rock. Frames/s: the whole pipeline, with stereo matching.</p>"
     )
+
+
+def _legend(colours: Mapping[str, Sequence[int]]) -> str:
+    entries = (
+        f'<span><i class="swatch" style="background:rgb({r},{g},{b})"></i>{escape(name)}</span>'
+        for name, (r, g, b) in colours.items()
+    )
+    return f'<p class="legend">{"".join(entries)}</p>'
+
+
+def _linked(row: Row) -> str:
+    return f'<a href="{escape(str(row["run"]))}/report.html">{escape(str(row["map"]))}</a>'
+
+
+def _number(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.2f}" if abs(value) < 10 else f"{value:.0f}"
+    return escape("–" if value is None else str(value))
+
+
+def _picture(path: Path, alt: str, caption: str) -> str:
+    return figure(f"{inline_image(path, alt, width_px=1100)}", caption)

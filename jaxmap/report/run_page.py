@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 
 from jaxmap.datasets.poses import read_poses
 from jaxmap.errors import JaxmapError
@@ -20,6 +21,7 @@ from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
 from jaxmap.labels import class_colours
 from jaxmap.mapping.store import MapAttributes, load_map
+from jaxmap.report.image_colours import SeenFrame, image_colours
 from jaxmap.report.page import (
     figure,
     header,
@@ -60,7 +62,7 @@ _FILES = {
     "errors.png": "where map and ground truth differ, picture",
 }
 _GROUPS = ("camera", "grid", "times", "points", "voxels", "ensemble", "memory", "sequence")
-_ELSEWHERE = {"skipped", "notes", "stages", "by_class"}
+_ELSEWHERE = {"skipped", "notes", "stages", "by_class", "key_frames"}
 
 
 @dataclass(frozen=True)
@@ -280,7 +282,13 @@ def in_3d(contents: RunContents) -> str:
     """The section with the interactive view; a page holds one at most."""
     if not len(contents.voxels.label):
         return section("In 3D", "<p>No voxel is occupied.</p>")
-    view = voxel_view(contents.voxels, contents.voxel_map.classes, contents.trajectory_world)
+    seen = seen_frames(contents)
+    view = voxel_view(
+        contents.voxels,
+        contents.voxel_map.classes,
+        contents.trajectory_world,
+        (lambda points_world: image_colours(points_world, seen)) if seen else None,
+    )
     return section(
         "In 3D",
         '<div id="view3d" class="view3d" role="figure" '
@@ -288,6 +296,27 @@ def in_3d(contents: RunContents) -> str:
         f"<p>{escape(view.caption)} Drag to turn, scroll to zoom.</p>"
         f'<script type="application/json" id="view3d-data">{script_text(str(view.figure.to_json()))}</script>',
     )
+
+
+def seen_frames(contents: RunContents) -> list[SeenFrame]:
+    """The key frames with their cameras; those that are not whole are left out."""
+    frames, camera = [], contents.group("camera")
+    poses = camera.get("key_frames")
+    for name, pose in poses.items() if isinstance(poses, dict) else ():
+        try:
+            with Image.open(contents.pictures[name]["left"]) as image:
+                pixels = np.asarray(image)
+            frames.append(
+                SeenFrame(
+                    pixels,
+                    np.array(pose, np.float64).reshape(4, 4),
+                    (camera["fx_px"], camera["fy_px"]),
+                    (camera["cx_px"], camera["cy_px"]),
+                )
+            )
+        except (OSError, KeyError, ValueError, TypeError):
+            continue
+    return frames
 
 
 def key_frame_row(contents: RunContents, frame: str) -> str:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 INK, FAINT, CASING = "#23272e", "#8a8f98", "#ffffff"
 UNOBSERVED_COLOUR = (241, 240, 236)
 DPI = 150
-_MAP_PX, _LEFT_PX, _RIGHT_PX, _BELOW_PX = 1500, 150, 50, 130
+_LEFT_PX, _RIGHT_PX, _BELOW_PX = 150, 50, 130
 _TEXT, _SMALL = 12, 11
 
 _LIGHT_WORLD = np.array([-0.5, 0.5, 0.75]) / np.linalg.norm([-0.5, 0.5, 0.75])
@@ -46,6 +46,17 @@ class ColourBar(NamedTuple):
     colour_map: Colormap | str
     span: tuple[float, float]
     ticks: dict[float, str] | None = None
+
+
+class Layout(NamedTuple):
+    """How a sheet is laid out: pixels of the map's longer side, and whether title and legend stand on the picture."""
+
+    map_px: int
+    with_legend: bool
+
+
+WHOLE, HALF = Layout(1500, True), Layout(820, False)
+"""A map that fills a page, and one of two side by side, of which the page has the legend."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +88,19 @@ class Sheet:
     georeferenced: bool = True
 
 
-def draw(sheet: Sheet, path: str | os.PathLike[str], overlay: Callable[[Axes], object] | None = None) -> None:
+def draw(
+    sheet: Sheet,
+    path: str | os.PathLike[str],
+    overlay: Callable[[Axes], object] | None = None,
+    layout: Layout = WHOLE,
+) -> None:
     """Draws a sheet into a PNG, north up; cells are whole pixels where they are large enough.
+
+    Args:
+        sheet: what is drawn.
+        path: the picture.
+        overlay: draws more onto the map.
+        layout: its size, and whether it has a legend.
 
     Raises:
         JaxmapError: the disk is full or refuses.
@@ -92,17 +114,18 @@ def draw(sheet: Sheet, path: str | os.PathLike[str], overlay: Callable[[Axes], o
     # Whole cells of margin, so that the edges of cells stay where they are.
     margin_m = np.ceil(np.maximum(0.04 * (high_m - low_m).max(), sheet.cell_m) / sheet.cell_m) * sheet.cell_m
     low_m, high_m = low_m - margin_m, high_m + margin_m
-    px_per_m = _MAP_PX / (high_m - low_m).max()
+    px_per_m = layout.map_px / (high_m - low_m).max()
     if px_per_m * sheet.cell_m.min() > 2:
         px_per_m = np.floor(px_per_m * sheet.cell_m.min()) / sheet.cell_m.min()
     map_width, map_height = (max(1, round(span * px_per_m)) for span in high_m - low_m)
 
-    handles, names = _legend(sheet)
+    handles, names = _legend(sheet) if layout.with_legend else ([], [""])
     width = max(map_width + _LEFT_PX + _RIGHT_PX, 1000)
     columns = int((0.75 * width - _LEFT_PX - _RIGHT_PX - 110) // (15 * max(map(len, names)) + 75))
     columns = min(max(columns, 1), len(names))
     legend_px = max(38 * -(-len(names) // columns) + (104 if sheet.bar else 0), 60) + 24
-    height = map_height + _BELOW_PX + legend_px + (84 if sheet.title else 40)
+    title = sheet.title if layout.with_legend else ""
+    height = map_height + _BELOW_PX + legend_px + (84 if title else 40)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     left = _LEFT_PX + (width - _LEFT_PX - _RIGHT_PX - map_width) // 2
     place = (left / width, (legend_px + _BELOW_PX) / height, map_width / width, map_height / height)
@@ -129,7 +152,7 @@ def draw(sheet: Sheet, path: str | os.PathLike[str], overlay: Callable[[Axes], o
         overlay(axes)
     axes.text(0.5, 0.5, sheet.remark, ha="center", va="center", transform=axes.transAxes, color=FAINT)
     title_at = (_LEFT_PX / width, 1 - 42 / height)
-    figure.text(*title_at, sheet.title, size=13, weight="bold", va="center", color=INK)
+    figure.text(*title_at, title, size=13, weight="bold", va="center", color=INK)
 
     spacing: dict[str, Any] = dict(handlelength=1.1, handleheight=1.1, columnspacing=1.6, borderaxespad=0, borderpad=0)
     anchor: dict[str, Any] = dict(
@@ -229,6 +252,7 @@ def top_down_picture(
     *,
     title: str = "",
     georeferenced: bool = True,
+    layout: Layout = WHOLE,
 ) -> None:
     """Draws the observed part of a top-down map into a PNG.
 
@@ -247,7 +271,8 @@ def top_down_picture(
         names = [*enumerate(classes), (IGNORE, "no label")]
         legend = [(name, colours[label]) for label, name in names if label in present]
     look: dict[str, Any] = dict(legend=[*legend, ("not observed", UNOBSERVED_COLOUR)], bar=bar, title=title)
-    draw(map_sheet(shown.colours, top, grid, trajectory_world, georeferenced=georeferenced, **look), path)
+    sheet = map_sheet(shown.colours, top, grid, trajectory_world, georeferenced=georeferenced, **look)
+    draw(sheet, path, layout=layout)
 
 
 class MapColours(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,9 @@ from jaxmap.report.wording import value_text
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-MAX_FACES = 40_000
+MAX_FACES = 100_000
+_PALETTE = 64
+"""Colours that are left of the images': one number a face, where colours would be text."""
 
 # The corners of a face, for each axis it can be normal to, counter-clockwise.
 _SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -77,11 +79,20 @@ class VoxelView(NamedTuple):
 
 
 def voxel_view(
-    voxels: OccupiedVoxels, classes: Sequence[str], trajectory_world: Float[np.ndarray, "N 3"] | None = None
+    voxels: OccupiedVoxels,
+    classes: Sequence[str],
+    trajectory_world: Float[np.ndarray, "N 3"] | None = None,
+    colours_of: Callable[[Float[np.ndarray, "M 3"]], UInt8[np.ndarray, "M 3"]] | None = None,
 ) -> VoxelView:
-    """Draws the visible faces of voxels by class (or height, by its buttons) with the rover's path.
+    """Draws the visible faces of voxels by class, height or the images' colours (its buttons), with the rover's path.
 
     Undersides are left out. Voxels are merged 2 x 2 x 2 until at most `MAX_FACES` faces are left.
+
+    Args:
+        voxels: of the map.
+        classes: their names.
+        trajectory_world: the path.
+        colours_of: gives the images' colours at centres of voxels (world); without it there is no such button.
     """
     from plotly.graph_objects import Figure
 
@@ -104,8 +115,13 @@ def voxel_view(
     if len(label):
         face_voxel = np.repeat(faces.voxel, 2)
         by_class = _class_colours(label, face_voxel, classes)
-        by_height = _height_colours((origin_m[2] + (index[:, 2] + 0.5) * size_m[2])[face_voxel].astype(np.float32))
-        buttons = [_buttons(by_class, by_height)] if by_class else []
+        centres_world = origin_m + (index + 0.5) * size_m
+        by_height = _height_colours(centres_world[face_voxel, 2].astype(np.float32))
+        colourings = {"Classes": by_class, "Height": by_height}
+        if colours_of is not None:
+            colourings["Images"] = _image_colours(colours_of(centres_world), face_voxel)
+        colourings = {name: colouring for name, colouring in colourings.items() if colouring is not None}
+        buttons = [_buttons(colourings)] if len(colourings) > 1 else []
         figure.add_mesh3d(
             **{axis: corners_world[:, i] for i, axis in enumerate("xyz")},
             **{corner: faces.triangle[:, i] for i, corner in enumerate("ijk")},
@@ -163,12 +179,35 @@ def _class_colours(label: np.ndarray, face_voxel: np.ndarray, classes: Sequence[
     )
 
 
-def _buttons(by_class: dict[str, Any], by_height: dict[str, Any]) -> dict[str, Any]:
-    def button(text: str, colouring: dict[str, Any]) -> dict[str, Any]:
-        # One value for one trace: the mesh is the first.
-        return dict(label=text, method="restyle", args=[{name: [value] for name, value in colouring.items()}, [0]])
+def _image_colours(colours: UInt8[np.ndarray, "M 3"], face_voxel: np.ndarray) -> dict[str, Any]:
+    """Colours of their own for voxels, by a palette."""
+    from PIL import Image
 
-    plain = dict(by_height, colorbar=dict(by_height["colorbar"], tickvals=None, ticktext=None))
+    picture = Image.fromarray(colours[None]).quantize(_PALETTE)
+    palette = np.array(picture.getpalette(), np.uint8).reshape(-1, 3)
+    # From dark to bright, so that neighbours in the palette look alike.
+    order = palette.sum(axis=-1, dtype=int).argsort(kind="stable")
+    rank = np.empty(len(order), np.uint8)
+    rank[order] = np.arange(len(order))
+    last = max(len(order) - 1, 1)
+    scale = [[step / last, f"rgb({r},{g},{b})"] for step, (r, g, b) in enumerate(palette[order].tolist())]
+    return dict(
+        intensity=rank[np.asarray(picture)[0]][face_voxel],
+        colorscale=scale if len(scale) > 1 else [scale[0], [1.0, scale[0][1]]],
+        cmin=0,
+        cmax=last,
+        showscale=False,
+    )
+
+
+def _buttons(colourings: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    def button(text: str, colouring: dict[str, Any]) -> dict[str, Any]:
+        # What one colouring does not set, another may have set.
+        bar = dict(tickvals=None, ticktext=None) | colouring.get("colorbar", {})
+        values = dict(dict(showscale=True) | colouring, colorbar=bar)
+        # One value for one trace: the mesh is the first.
+        return dict(label=text, method="restyle", args=[{name: [value] for name, value in values.items()}, [0]])
+
     return dict(
         type="buttons",
         direction="right",
@@ -178,7 +217,7 @@ def _buttons(by_class: dict[str, Any], by_height: dict[str, Any]) -> dict[str, A
         yanchor="top",
         pad=dict(l=4, t=4),
         showactive=True,
-        buttons=[button("Classes", by_class), button("Height", plain)],
+        buttons=[button(text, colouring) for text, colouring in colourings.items()],
     )
 
 

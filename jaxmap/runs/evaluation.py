@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 import jaxmap
 from jaxmap.datasets.crs import Extent, crs_text, read_crs
@@ -194,21 +194,26 @@ def evaluate_run(
     return evaluation, layer
 
 
-def write_evaluation(
-    out: Path, picture: Path, evaluation: Evaluation, layer: ClassLayer, backdrop: Path | None
-) -> None:
-    """Writes the scores as JSON and the error map as PNG.
+def read_backdrop(path: Path, evaluation: Evaluation, layer: ClassLayer) -> UInt8[np.ndarray, "BI BJ 3"]:
+    """An orthomosaic on the cells of an evaluation, several samples for each, moved as the truth was.
 
     Raises:
-        JaxmapError: the backdrop cannot be read, or writing failed.
+        JaxmapError: it cannot be read.
     """
-    image = None
-    if backdrop is not None:
-        # On the cells of the evaluation, moved as the truth was.
-        pixels, T_crs_pixel, crs = read_picture(backdrop, layer.place)
-        place = (evaluation.cells, layer.site_origin, layer.crs, evaluation.alignment)
-        image = sample_between(pixels, pixel_corners(T_crs_pixel, crs, *place), _BACKDROP_SAMPLES)
-    write_error_map(picture, evaluation, image)
+    pixels, T_crs_pixel, crs = read_picture(path, layer.place)
+    place = (evaluation.cells, layer.site_origin, layer.crs, evaluation.alignment)
+    return sample_between(pixels, pixel_corners(T_crs_pixel, crs, *place), _BACKDROP_SAMPLES)
+
+
+def write_evaluation(
+    out: Path, picture: Path, evaluation: Evaluation, backdrop: UInt8[np.ndarray, "BI BJ 3"] | None
+) -> None:
+    """Writes the scores as JSON and the error map as PNG, over a backdrop (`read_backdrop`) where there is one.
+
+    Raises:
+        JaxmapError: writing failed.
+    """
+    write_error_map(picture, evaluation, backdrop)
     write_json(out, evaluation.scores)
 
 
@@ -216,8 +221,9 @@ def summary(scores: dict[str, Any]) -> str:
     """One line on what scores rest on."""
     frames = "" if scores["frames"] is None else f"{scores['frames']} frames, "
     within = "" if scores["max_range_m"] is None else f" within {scores['max_range_m']:g} m"
+    rocks = scores["rocks"]
     return (
         f"{frames}{scores['cells']:,} cells of {scores['cell_size_m']:g} m observed and labelled{within}, "
-        f"{scores['rock_cells']:,} of them {scores['class']}; {scores['rocks']['count']} rocks in view, "
-        f"{scores['rocks']['missed']} missed"
+        f"{scores['rock_cells']:,} of them {scores['class']}; {rocks['count'] - rocks['missed']} of {rocks['count']} "
+        f"rocks in view found (at least {rocks['found_share']:.0%} of their area called {scores['class']})"
     )

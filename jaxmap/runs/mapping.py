@@ -83,7 +83,10 @@ def run_plan(
                 step_profile.step_done()
             on_frame(fused)
             if fused.info is not None and fused.prepared.index in plan.key_frames:
+                started_s = time.perf_counter()
                 _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
+                # Pictures are no part of the pipeline that is timed.
+                resumed_s += time.perf_counter() - started_s
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
@@ -214,6 +217,11 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "width_px": camera.width_px,
             "height_px": camera.height_px,
             "rectified_here": plan.front_end.rectifier is not None,
+            # Poses of the rectified camera, relative to the site origin.
+            "key_frames": {
+                f"{index:06d}": (sequence.T_world_camera[index] @ plan.front_end.T_raw_rectified).round(6).tolist()
+                for index in sorted(plan.key_frames)
+            },
         },
         "grid": {
             "shape": list(grid.shape),

@@ -14,7 +14,7 @@ import rasterio
 from fixtures import cli, shared_cache  # noqa: F401
 
 import jaxmap.commands.demo as command
-from jaxmap.commands.demo import demo_rows
+from jaxmap.commands.demo import demo_rows, found_rocks
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.poses import read_poses
 from jaxmap.datasets.samples import sample_truth
@@ -26,21 +26,28 @@ MIB = 2**20
 
 
 def test_a_row_of_the_demo(cli, monkeypatch, tmp_path):
-    _, preset, config = demo_rows()["plane_chiodini2020"]
+    _, config = demo_rows()["plane_chiodini2020"]
     # Labels from files: the quickest step to compile.
     labels = dict(labeller="files", labels=sample_truth() / "labels", labels_are="raw")
     config = replace(config, stop=2, stereo=replace(config.stereo, num_disparities=64), **labels)
-    monkeypatch.setattr(command, "demo_rows", lambda: {"true": ("true labels", preset, config)})
+    monkeypatch.setattr(command, "demo_rows", lambda: {"true": ("true labels", config)})
     outcome = cli("demo", "--out", tmp_path / "demo")
     assert outcome.status == 0, outcome.err
     (row,) = json.loads((tmp_path / "demo" / "table.json").read_text())
-    assert (row["run"], row["labeller"], row["preset"], row["frames"]) == ("true", "true labels", "chiodini2020", 2)
+    assert (row["run"], row["map"], row["frames"]) == ("true", "true labels", 2)
     page = (tmp_path / "demo" / "report.html").read_text("utf-8")
-    for text in ("2 stereo frames", "Left image", "Labels", "Ground truth", "Top-down map: true", "Errors: true"):
+    for text in ("2 stereo frames", "Left image", "Labels", "Ground truth", "Top-down map", "Errors: true", "Images"):
         assert text in page
-    for path in ("truth.png", "orthomosaic.png", "true/report.html", "true/errors.png"):
+    for path in ("truth.png", "map.png", "true.png", "true/report.html", "true/errors.png"):
         assert (tmp_path / "demo" / path).stat().st_size > 1000
-    assert f"{row['accuracy']:.3g}" in outcome.out
+    assert f"{row['accuracy']:.3g}" in outcome.out and row["found"] in outcome.out
+
+
+def test_rocks_are_counted_by_size():
+    sizes = [(0.0, 0.1, 9, 8), (0.1, 0.2, 6, 1), (0.5, 1.0, 2, 0), (1.0, None, 2, 1)]
+    rows = [dict(zip(("from", "to", "count", "missed"), size, strict=True)) for size in sizes]
+    found = found_rocks({"count": 19, "missed": 10, "by_diameter_m": rows})
+    assert found == {"found": "9 of 19", "under 0.2 m": "6 of 15", "0.2 to 0.5 m": None, "over 0.5 m": "3 of 4"}
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +63,8 @@ def demo(tmp_path_factory, shared_cache):
 @pytest.mark.slow
 def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
     rows = json.loads((demo / "table.json").read_text())
-    assert [(row["labeller"], row["preset"]) for row in rows] == [
-        (labeller, preset) for labeller in ("plane", "deeplab") for preset in ("chiodini2020", "default")
-    ]
+    assert [row["run"] for row in rows] == ["plane_chiodini2020", "deeplab_chiodini2020", "relief", "relief_deeplab"]
     for row in rows:
-        assert row["run"] == f"{row['labeller']}_{row['preset']}"
         assert row["accuracy"] == (row["tp"] + row["tn"]) / (row["tp"] + row["tn"] + row["fp"] + row["fn"])
         assert row["iou"] == row["tp"] / (row["tp"] + row["fp"] + row["fn"])
         assert row["frames_per_s"] > 0 and row["peak_resident_mib"] < 4096
@@ -68,11 +72,9 @@ def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
 
 
 @pytest.mark.slow
-def test_the_network_beats_the_plane_and_our_rule_the_paper_s(demo):
-    scores = {(row["labeller"], row["preset"]): row for row in json.loads((demo / "table.json").read_text())}
-    best = scores["deeplab", "default"]
-    assert best["iou"] > scores["plane", "default"]["iou"] and best["iou"] > scores["deeplab", "chiodini2020"]["iou"]
-    assert best["accuracy"] > 0.95
+def test_relief_beats_the_plane_and_both_together_are_best(demo):
+    iou = {row["run"]: row["iou"] for row in json.loads((demo / "table.json").read_text())}
+    assert iou["relief_deeplab"] == max(iou.values()) and iou["relief"] > 1.5 * iou["plane_chiodini2020"]
 
 
 def test_the_bundled_network_is_small_and_knows_the_rover_s_classes():

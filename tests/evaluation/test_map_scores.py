@@ -18,7 +18,7 @@ from jaxmap.evaluation.cells import column_shares, make_cells, map_cells
 from jaxmap.evaluation.evaluate import evaluate_map, find_rocks, rock_table
 from jaxmap.evaluation.map_scores import score_cells
 from jaxmap.evaluation.options import ScoringOptions
-from jaxmap.evaluation.truth_cells import Alignment, truth_cells
+from jaxmap.evaluation.truth_cells import Alignment, samples_of, truth_cells
 from jaxmap.types import GridSpec
 
 KEYS = ["accuracy", "iou", "precision", "recall", "f1", "coverage", "tp", "fp", "fn", "tn", "nll", "brier", "ece"]
@@ -279,6 +279,16 @@ def test_the_ground_is_that_of_the_sand_beside_rocks():
     assert np.isfinite(ground).all() and (ground_height(rocky, np.zeros_like(observed), (0.2, 0.2)) == 0).all()
 
 
+def test_stones_smaller_than_a_cell_are_found_by_the_columns_of_the_map():
+    labels = np.ones((40, 40), np.uint8)
+    labels[8:10, 8:10] = labels[24:26, 24:26] = 2
+    called = np.zeros((40, 40), bool)
+    called[8:10, 8:9] = True
+    scores = evaluate_map(class_layer(called, voxel_m=0.05), raster(labels, pixel_m=0.05)).scores
+    assert scores["tp"] == scores["rock_cells"] == 0
+    assert (scores["rocks"]["count"], scores["rocks"]["missed"]) == (2, 1)
+
+
 def test_rocks_are_found_and_missed_by_size_and_range():
     labels = np.ones((60, 60), np.uint8)
     labels[4:8, 4:8] = 2  # one cell, found
@@ -290,6 +300,7 @@ def test_rocks_are_found_and_missed_by_size_and_range():
     truth = truth_cells(raster(labels, pixel_m=0.05), cells)
     range_m = np.full((15, 15), 3.0)
     range_m[5:8, 5:8] = 7.0
+    called = samples_of(called, truth.per_cell)
     rocks = find_rocks(truth, 0.2, called, np.ones((15, 15), bool), range_m)
     np.testing.assert_allclose(sorted(rocks.diameter_m), 2 * np.sqrt(np.array([8, 16, 144]) * 0.05**2 / np.pi))
     table = rock_table(rocks)

@@ -9,7 +9,7 @@ from PIL import Image
 from jaxmap.fusion.query import TopDown
 from jaxmap.labels import IGNORE, ROVER_CLASSES, class_colours
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
-from jaxmap.report.top_down import UNOBSERVED_COLOUR, _nice, top_down_colours, top_down_picture
+from jaxmap.report.top_down import HALF, UNOBSERVED_COLOUR, _nice, top_down_colours, top_down_picture
 from jaxmap.types import make_grid
 
 MANY = tuple(f"class {index}" for index in range(21))
@@ -121,6 +121,16 @@ def test_top_down_map_of_every_shape(tmp_path, classes, shape, size) -> None:
     with Image.open(tmp_path / "bev.png") as image:
         assert max(image.size) < 2400
         assert min(image.size) > 150
+
+
+def test_maps_side_by_side_have_one_size_whatever_they_show(tmp_path) -> None:
+    grid = make_grid([0, 0, 0], [6, 4, 1], 0.2)
+    sizes = []
+    for classes in (ROVER_CLASSES, MANY):
+        top_down_picture(flat_view(classes=classes), grid, classes, None, tmp_path / "bev.png", layout=HALF)
+        with Image.open(tmp_path / "bev.png") as image:
+            sizes.append(image.size)
+    assert sizes[0] == sizes[1] and sizes[0][0] < 1200
 
 
 def test_top_down_map_of_nothing(tmp_path) -> None:

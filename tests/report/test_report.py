@@ -155,6 +155,24 @@ def test_view_is_in_metres_with_a_toggle_and_the_path() -> None:
     assert "NaN" not in content
 
 
+def test_view_in_the_colours_of_the_images() -> None:
+    index = np.argwhere(np.ones((9, 1, 1), bool))
+    shades = [(10, 20, 30), (200, 190, 180)]
+
+    def colours_of(points_world):
+        return np.where(points_world[:, :1] < 0.8, *np.array(shades, np.uint8)).astype(np.uint8)
+
+    figure, _ = voxel_view(voxels_of(index), ROVER_CLASSES, colours_of=colours_of)
+    buttons = figure.layout.updatemenus[0].buttons
+    assert [button.label for button in buttons] == ["Classes", "Height", "Images"]
+    (colouring, _) = buttons[2].args
+    (scale,), (intensity,) = colouring["colorscale"], colouring["intensity"]
+    assert len(intensity) == len(figure.data[0].i) and colouring["showscale"] == [False]
+    span = colouring["cmax"][0] - colouring["cmin"][0]
+    drawn = {next(colour for stop, colour in scale if np.isclose(stop, value / span)) for value in intensity.tolist()}
+    assert drawn == {f"rgb({r},{g},{b})" for r, g, b in shades}
+
+
 def test_view_is_coarsened_and_says_so(monkeypatch) -> None:
     monkeypatch.setattr(voxel_view_module, "MAX_FACES", 100)
     figure, caption = voxel_view(voxels_of(np.argwhere(np.ones((20, 20, 2), bool))), ROVER_CLASSES)

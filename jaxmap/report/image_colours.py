@@ -1,0 +1,83 @@
+"""The colours of voxels in the images: each takes that of the nearest frame that sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+
+_BLOCK_PX = 8
+"""Pixels along a side of the blocks in which the nearest point hides those behind it."""
+_HIDDEN_M, _HIDDEN_SHARE = 0.3, 0.12
+"""How far behind the nearest point of its block a point is hidden: more with distance, where a block of level ground
+is long."""
+_UNSEEN = 128
+_BRIGHT = 235.0
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """A rectified left image with its camera.
+
+    Attributes:
+        image: grey or RGB.
+        T_world_camera: its pose (x right, y down, z forward).
+        focal_px: fx, fy.
+        centre_px: cx, cy.
+    """
+
+    image: UInt8[np.ndarray, "H W *rgb"]
+    T_world_camera: Float64[np.ndarray, "4 4"]
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+
+
+def image_colours(points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenFrame]) -> UInt8[np.ndarray, "N 3"]:
+    """The colours of points in the nearest frame that sees them, brightened alike so that the brightest are bright.
+
+    A point hides those well behind it in the same block of pixels. Points that no frame sees are grey.
+    """
+    from PIL import Image, ImageFilter
+
+    points_world = np.asarray(points_world, np.float64).reshape(-1, 3)
+    colours = np.zeros((len(points_world), 3))
+    nearest_m = np.full(len(points_world), np.inf)
+    for frame in frames:
+        depth_m, column, row = _projected(points_world, frame)
+        seen = _unhidden(depth_m, column, row, frame.image.shape[:2]) & (depth_m < nearest_m)
+        # Blurred, as a voxel covers more than a pixel.
+        smooth = np.asarray(Image.fromarray(frame.image).convert("RGB").filter(ImageFilter.BoxBlur(2)))
+        colours[seen] = smooth[row[seen], column[seen]]
+        nearest_m[seen] = depth_m[seen]
+    known = np.isfinite(nearest_m)
+    if known.any():
+        colours[known] *= _BRIGHT / max(float(np.percentile(colours[known].max(axis=-1), 98)), 1.0)
+    colours[~known] = _UNSEEN
+    return np.rint(colours.clip(0, 255)).astype(np.uint8)
+
+
+def _projected(points_world: np.ndarray, frame: SeenFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth of points, and the pixel they fall into; the depth is infinite outside the image."""
+    x, y, z = ((points_world - frame.T_world_camera[:3, 3]) @ frame.T_world_camera[:3, :3]).T
+    ahead = z > 0.05
+    depth_m = np.where(ahead, z, 1.0)
+    column, row = (
+        np.floor(focal * side / depth_m + centre + 0.5)
+        for focal, centre, side in zip(frame.focal_px, frame.centre_px, (x, y), strict=True)
+    )
+    height, width = frame.image.shape[:2]
+    inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row = (np.where(inside, index, 0).astype(int) for index in (column, row))
+    return np.where(inside, depth_m, np.inf), column, row
+
+
+def _unhidden(depth_m: np.ndarray, column: np.ndarray, row: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Points in the image with none well before them."""
+    block = row // _BLOCK_PX, column // _BLOCK_PX
+    nearest_m = np.full((-(-size[0] // _BLOCK_PX), -(-size[1] // _BLOCK_PX)), np.inf)
+    np.minimum.at(nearest_m, block, depth_m)
+    before_m = nearest_m[block]
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(depth_m) & (depth_m <= before_m + np.maximum(_HIDDEN_M, _HIDDEN_SHARE * before_m))
