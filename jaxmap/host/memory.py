@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import platform
 import resource
@@ -20,7 +19,6 @@ _SETTINGS = {
     "glibc.malloc.arena_max": "1",
 }
 _SINCE = (2, 26)
-_GAP_BYTES = 1 << 28
 
 
 def restart_with_lasting_memory() -> None:
@@ -36,25 +34,6 @@ def restart_with_lasting_memory() -> None:
     settings = ":".join([*filter(None, [settings]), *(f"{name}={value}" for name, value in _SETTINGS.items())])
     sys.stdout.flush()
     os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, _TUNABLES: settings})
-
-
-def settle_memory() -> None:
-    """Returns memory that is free at the moment to the system, and sets a gap aside for what is small.
-
-    To be called before the first large block is taken. In lasting memory a small array that comes to lie where the
-    gigabytes of a step were leaves too little room for those of the next step, which takes a second place, and a
-    third. The C library puts a block into the smallest gap that holds it: this one, of which only what is used is real.
-    """
-    if not _is_supported():
-        return
-    library = ctypes.CDLL(None)
-    library.malloc.restype, library.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
-    library.free.argtypes = [ctypes.c_void_p]
-    library.malloc_trim(0)
-    gap = library.malloc(_GAP_BYTES)
-    # Its neighbour, never used nor freed, keeps it from joining the end of the heap; a small one would lie elsewhere.
-    library.malloc(_GAP_BYTES)
-    library.free(gap)
 
 
 def peak_resident_mib() -> float:

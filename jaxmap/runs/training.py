@@ -18,7 +18,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
-from jaxmap.host.memory import settle_memory
 from jaxmap.host.output_folder import check_same_settings, write_json, write_yaml
 from jaxmap.models.checkpoint import save_model
 from jaxmap.models.deeplab import Weights
@@ -245,12 +244,7 @@ class TrainingRun:
         epoch, first_step, meter = len(self._log.history), int(state.step), EpochMeter()
         try:
             for step, batch in enumerate(plan.data.batches(plan.order, first_step), first_step):
-                placed = jax.device_put(batch, split)
-                if step == first_step:
-                    # The call below finds the step compiled, and no longer resident what the compiler took.
-                    plan.trainer.step.lower(state, placed, key).compile()  # type: ignore[attr-defined]
-                    settle_memory()
-                state, metrics = plan.trainer.step(state, placed, key)
+                state, metrics = plan.trainer.step(state, jax.device_put(batch, split), key)
                 if not bool(metrics.finite):
                     raise self._not_finite(metrics, step, epoch)
                 self._on_step(step + 1, meter.add(metrics, plan.config.batch_size))

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from jaxmap.geometry.relief import RELIEF_CHANNELS
-from jaxmap.host.memory import peak_resident_mib, restart_with_lasting_memory, settle_memory
+from jaxmap.host.memory import peak_resident_mib, restart_with_lasting_memory
 from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainConfig
 from jaxmap.training.initial_network import make_initial_network
 from jaxmap.training.step import Batch, make_trainer
@@ -33,7 +33,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--pretrained", action="store_true", help="the backbone's batch norms are frozen")
     parser.add_argument("--returned", action="store_true", help="freed memory goes back to the system")
-    parser.add_argument("--unsettled", action="store_true", help="without `settle_memory`")
     parser.add_argument("--option", action="append", default=[], metavar="SECTION.NAME=VALUE")
     given = parser.parse_args()
     if not given.returned:
@@ -53,8 +52,6 @@ def main() -> None:
     counted = compiled.memory_analysis().temp_size_in_bytes / 2**20
     compiling = peak_resident_mib()
     laps, loss = [], float("nan")
-    if not given.unsettled:
-        settle_memory()
     for _ in range(given.steps):
         started_s, busy_s = time.perf_counter(), time.process_time()
         state, metrics = compiled(state, batch, key)
