@@ -12,6 +12,7 @@ from jaxmap.errors import FrameError, UsageError
 from jaxmap.host.settings import NotNegative, Positive, options
 
 _SUBPIXELS = 16
+_FAR_PX = np.float32(1e6)
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 """Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
@@ -125,8 +126,8 @@ class Matcher:
             return disparity_px
         square = np.ones((self.options.edge_window_px,) * 2, np.uint8)
         unknown = np.isnan(disparity_px)
-        least = cv2.erode(np.where(unknown, np.float32(np.inf), disparity_px), square)
-        greatest = cv2.dilate(np.where(unknown, np.float32(-np.inf), disparity_px), square)
+        least = cv2.erode(np.where(unknown, _FAR_PX, disparity_px), square)
+        greatest = cv2.dilate(np.where(unknown, -_FAR_PX, disparity_px), square)
         disparity_px[greatest - least > self.options.edge_step_px] = np.nan
         return disparity_px
 
