@@ -76,8 +76,11 @@ def relief(camera: StereoCamera, up_camera, disparity_px, disparity_sigma_px: fl
     )
     floating = np.zeros_like(inside)
     for i, j in np.argwhere(valid & (above_m > 0.5)):
-        ground_m = depth_m[i:, j][on_plane[i:, j]]
-        floating[i, j] = found and (ground_m > depth_m[i, j] + 1 + 3 * sigma_depth_m[i, j]).any()
+        columns_below = straight_below(
+            points[i, j], R, (fx / STRIDE, fy / STRIDE), (u[0, 0] - cx, v[0, 0] - cy), inside.shape
+        )
+        farthest_m = [max((depth_m[at] for at in below if on_plane[at]), default=0.0) for below in columns_below]
+        floating[i, j] = found and min(farthest_m) > depth_m[i, j] + 1 + 3 * sigma_depth_m[i, j]
     inside &= ~floating
     means, seen = cells_of(inside)
     cell_x, cell_y, cell_z, cell_sigma_m = means
@@ -118,7 +121,7 @@ def block_means(disparity_px: np.ndarray) -> np.ndarray:
     for i in range(height):
         for j in range(width):
             block = disparity_px[STRIDE * i : STRIDE * (i + 1), STRIDE * j : STRIDE * (j + 1)]
-            known = block[np.isfinite(block)]
+            known = block[np.abs(block) < 1e5]
             if 2 * known.size >= STRIDE**2:
                 means[i, j] = known.mean()
     return means
@@ -131,6 +134,25 @@ def level_rotation(up: np.ndarray) -> np.ndarray:
     forward = ahead - (ahead @ up) * up
     forward /= np.linalg.norm(forward)
     return np.stack([forward, np.cross(up, forward), up])
+
+
+def straight_below(point, R, focal_px, corner_px, shape) -> list[list[tuple[int, int]]]:
+    """The blocks below a point: those of three columns of a level camera's image, from the point's row on."""
+    height, width = shape
+    level_px, middle, (x, y, z) = np.sqrt(focal_px[0] * focal_px[1]), (width - 1) / 2, point
+    here = np.round(middle - y / x * level_px) if x > 0 else -1
+    if not 0 <= here < width:
+        return [[]]
+    blocks = [[], [], []]
+    for row in range(max(int(np.round(-z / x * level_px)), 0), height):
+        for below, column in zip(blocks, np.clip([here - 1, here, here + 1], 0, width - 1), strict=True):
+            ray = np.array([1.0, (middle - column) / level_px, -row / level_px]) @ R
+            if ray[2] > 0:
+                j = int(np.round(focal_px[0] * ray[0] / ray[2] - corner_px[0] / STRIDE))
+                i = int(np.round(focal_px[1] * ray[1] / ray[2] - corner_px[1] / STRIDE))
+                if 0 <= i < height and 0 <= j < width:
+                    below.append((i, j))
+    return blocks
 
 
 def height_at(plane, x, y):

@@ -24,7 +24,7 @@ CAMERA_HEIGHT_M = 1.1
 FARTHEST_M = 14.0
 
 Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Height of the ground below the camera's level, from x forward and y left."""
+"""Heights of the ground from x forward and y left, in the level frame of the camera."""
 
 
 class Box(NamedTuple):
@@ -54,26 +54,33 @@ class View(NamedTuple):
     R_level_camera: np.ndarray
 
 
-def incline(slope_x: float = 0.0, slope_y: float = 0.0) -> Surface:
-    """A plane below the camera."""
-    return lambda x, y: -CAMERA_HEIGHT_M + slope_x * x + slope_y * y
-
-
 def view_of(
-    surface: Surface | None = None,
+    slopes: tuple[float, float] = (0.0, 0.0),
     boxes: Sequence[Box] = (),
     *,
+    bumps: Surface | None = None,
     camera: StereoCamera = CAMERA,
     pitch_deg: float = 18.0,
     roll_deg: float = 0.0,
 ) -> View:
-    """Casts a ray through each pixel; the camera is pitched down, then rolled about its axis."""
-    surface = surface or incline()
+    """Casts a ray through each pixel; the camera is pitched down, then rolled about its axis.
+
+    Args:
+        slopes: of the ground, along x and y.
+        boxes: that stand on it.
+        bumps: are added to it.
+        camera: sees it.
+        pitch_deg, roll_deg: of the camera.
+    """
+
+    def surface(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return -CAMERA_HEIGHT_M + slopes[0] * x + slopes[1] * y + (0.0 if bumps is None else bumps(x, y))
+
     R = rotation(pitch_deg, roll_deg)
     v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(np.float64)
     fx, fy, cx, cy = (float(getattr(camera, f"{name}_px")) for name in ("fx", "fy", "cx", "cy"))
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1) @ R.T
-    depth_m = _ground_depth(rays, surface)
+    depth_m = _plane_depth(rays, slopes) if bumps is None else _ground_depth(rays, surface)
     for box in boxes:
         depth_m = np.minimum(depth_m, _box_depth(rays, box))
     with np.errstate(invalid="ignore"):
@@ -91,6 +98,13 @@ def rotation(pitch_deg: float, roll_deg: float) -> np.ndarray:
     pitched = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(p), np.sin(p)], [0.0, -np.sin(p), np.cos(p)]])
     rolled = np.array([[np.cos(r), -np.sin(r), 0.0], [np.sin(r), np.cos(r), 0.0], [0.0, 0.0, 1.0]])
     return level @ pitched @ rolled
+
+
+def _plane_depth(rays: np.ndarray, slopes: tuple[float, float]) -> np.ndarray:
+    fall = slopes[0] * rays[..., 0] + slopes[1] * rays[..., 1] - rays[..., 2]
+    with np.errstate(divide="ignore"):
+        depth_m = np.where(fall > 0, CAMERA_HEIGHT_M / fall, np.inf)
+    return np.where(depth_m < FARTHEST_M, depth_m, np.inf)
 
 
 def _ground_depth(rays: np.ndarray, surface: Surface) -> np.ndarray:

@@ -68,21 +68,19 @@ class Lattice(NamedTuple):
         return cls(edge_m, rows, 2 * round(0.75 * rows))
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """How many cells there are."""
         return self.rows * self.columns
 
-    def index(
-        self, points: LevelPoints, valid: Bool[Array, "*s"]
-    ) -> tuple[Int[Array, "*s"], Bool[Array, "*s"]]:
-        """The cell that each point lies in, `count` for those in none, and whether it lies in one."""
+    def cell_of(self, points: LevelPoints, valid: Bool[Array, "*s"]) -> tuple[Int[Array, "*s"], Bool[Array, "*s"]]:
+        """The cell that each point lies in, `size` for those in none, and whether it lies in one."""
         row, column = jnp.floor(points.x_m / self.edge_m), jnp.floor(points.y_m / self.edge_m) + self.columns // 2
         inside = valid & (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
         flat = jnp.where(inside, row * self.columns + column, 0.0).astype(jnp.int32)
-        return jnp.where(inside, flat, self.count), inside
+        return jnp.where(inside, flat, self.size), inside
 
     def centres(self, index: Int[Array, "*s"]) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
-        """x and y of the middle of cells."""
+        """The middle of cells: x and y."""
         row, column = index // self.columns, index % self.columns - self.columns // 2
         return (row + 0.5) * self.edge_m, (column + 0.5) * self.edge_m
 
@@ -116,7 +114,7 @@ class Ground(NamedTuple):
 
     Attributes:
         surface: around the middle of each cell.
-        roughness_m: root mean square of the distance of the cells around from the ground, of half a metre at most each.
+        roughness_m: root mean square of the distances, of half a metre at most, of the cells around from the ground.
         step_m: greatest difference of height, above the plane of the ground, between the cells around.
         seen: cells that hold points; over others the ground is a guess.
     """
@@ -150,14 +148,14 @@ def mean_cells(
 
     def total(values: Array) -> Array:
         values = jnp.where(inside, values, 0.0).reshape(-1)
-        return lattice.field(jnp.zeros(lattice.count, values.dtype).at[index.reshape(-1)].add(values, mode="drop"))
+        return lattice.field(jnp.zeros(lattice.size, values.dtype).at[index.reshape(-1)].add(values, mode="drop"))
 
     points_in = total(jnp.ones_like(points.z_m))
     x, y, z, sigma_m = (total(values) / jnp.maximum(points_in, 1.0) for values in points)
     # False matches scatter: a true surface fills a tenth at least of the pixels that a cell across the view would.
     facing_px = (focal_px * lattice.edge_m) ** 2 / jnp.maximum(x * x + y * y + z * z, 0.01)
     seen = points_in > 0.1 * facing_px.clip(0, 100)
-    centre_x, centre_y = lattice.centres(lattice.field(jnp.arange(lattice.count)))
+    centre_x, centre_y = lattice.centres(lattice.field(jnp.arange(lattice.size)))
     x, y, z = (jnp.where(seen, *pair) for pair in ((x, centre_x), (y, centre_y), (z, 0.0)))
     return Cells(LevelPoints(x, y, z, sigma_m), seen, centre_x, centre_y)
 
@@ -165,7 +163,7 @@ def mean_cells(
 def fit_plane(cells: Cells) -> tuple[Incline, Bool[Array, ""]]:
     """The plane through most of the ground, and whether there is one below the camera.
 
-    Reweighted least squares with Cauchy weights (Holland and Welsch 1977), of ever narrower scale. What lies high counts
+    Least squares, reweighted by Cauchy weights (Holland and Welsch 1977) of ever narrower scale. What lies high counts
     less than what lies low: rocks stand on the ground.
     """
     x, y, z, sigma_m = cells.mean
@@ -196,7 +194,7 @@ def fit_ground(lattice: Lattice, cells: Cells, plane: Incline, options: GroundOp
     smooth_m, present = total_m / jnp.maximum(mass, _LEAST_MASS), mass > 0.05
 
     reach = max(1, round(options.rock_m / lattice.edge_m / 2))
-    level_m = jax.lax.stop_gradient(_opened(smooth_m, present, reach))
+    level_m = _opened(jax.lax.stop_gradient(smooth_m), present, reach)
     surface = Incline(level_m, jnp.zeros_like(level_m), jnp.zeros_like(level_m))
     wide = _Blur.of(lattice, options.smooth_m)
     scale_m = 3 * (options.tolerance_m + 2 * sigma_m)
@@ -227,12 +225,13 @@ def _plane_through(weight: Array, x: Array, y: Array, z: Array) -> Incline:
     mean_x, mean_y, mean_z = (jnp.vdot(weight, values) / total for values in (x, y, z))
     dx, dy, dz = x - mean_x, y - mean_y, z - mean_z
     products = (dx * dx, dx * dy, dy * dy, dx * dz, dy * dz)
-    slope_x, slope_y = _slopes(*(jnp.vdot(weight, values) / total for values in products), 1e-6)
+    xx, xy, yy, xz, yz = (jnp.vdot(weight, values) / total for values in products)
+    slope_x, slope_y = _slopes(xx, xy, yy, xz, yz, 1e-6)
     return Incline(mean_z - slope_x * mean_x - slope_y * mean_y, slope_x, slope_y)
 
 
 def _local_planes(blur: _Blur, weight: Array, cells: Cells, z: Array) -> Incline:
-    """The planes of least squares through the weighted surroundings of each cell; heights go to 0 far from all weight."""
+    """The planes of least squares through the weighted surroundings of each cell; 0 far from all weight."""
     x, y = cells.mean.x_m, cells.mean.y_m
     moments = (jnp.ones_like(x), x, y, z, x * x, x * y, y * y, x * z, y * z)
     mass, *sums = blur(*(weight * moment for moment in moments))
@@ -290,5 +289,6 @@ def _least(field: Array, reach: int) -> Array:
     """The least value of the square of cells around each."""
     least: Any = jax.lax.min
     for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
-        field = jax.lax.reduce_window(field, _FAR, least, size, (1, 1), "SAME")
+        # From infinity: from any other number it has no gradient.
+        field = jax.lax.reduce_window(field, jnp.inf, least, size, (1, 1), "SAME")
     return field

@@ -31,6 +31,8 @@ _NEAR_M, _HIGH_M = 0.3, 0.5
 """Points nearer to the plane of the ground lie on it; points farther above it may float."""
 _LEAST_SHARE = 0.3
 """Of the points, that lie on the plane of the ground: on hills of half a metre it is 0.4, under a false up 0.25."""
+_MOST_PX = 1e5
+"""Greater disparities are none: no image is so wide."""
 _STRIP_BLOCKS = 32
 
 
@@ -45,8 +47,8 @@ class Relief(NamedTuple):
         step_m: greatest difference of height between the cells around.
         depth_m: of the surface along the optical axis.
         known: where all this is known; elsewhere it is 0.
-        floating: false matches in the air, below which farther ground is seen. Whatever stands on the ground hides what
-            lies behind it: down a column of the image a true surface comes nearer.
+        floating: false matches in the air, straight below which farther ground is seen. Whatever stands on the ground
+            hides what lies behind it.
         found: whether there is ground below the camera at all.
     """
 
@@ -86,17 +88,17 @@ def relief_of(
         depth_m = points_camera[..., 2]
         sigma_depth_m = depth_sigma(camera, depth_m, disparity_sigma_px / RELIEF_STRIDE)
         R = level_rotation(up_camera)
-        x, y, z = (sum(R[i, k] * points_camera[..., k] for k in range(3)) for i in range(3))
+        x, y, z = _turned(R, points_camera[..., 0], points_camera[..., 1], depth_m)
         points = LevelPoints(x, y, z, jnp.abs(z) * sigma_depth_m / depth_m)
 
         lattice, focal_px = Lattice.of(options), jnp.sqrt(camera.fx_px * camera.fy_px)
-        index, inside = lattice.index(points, valid)
+        index, inside = lattice.cell_of(points, valid)
         plane, found = fit_plane(mean_cells(lattice, points, index, inside, focal_px))
         above_m = z - plane.at(x, y)
         on_plane = inside & (jnp.abs(above_m) < _NEAR_M)
         # Under a wrong direction up, planes are found through walls and columns: few points lie on those.
         found &= on_plane.sum() >= _LEAST_SHARE * inside.sum()
-        ground_m = _farthest_below(jnp.where(on_plane, depth_m, 0.0))
+        ground_m = _farthest_below(camera, R, jnp.where(on_plane, depth_m, 0.0), points)
         floating = found & valid & (above_m > _HIGH_M) & (depth_m + 1.0 + 3 * sigma_depth_m < ground_m)
         inside &= ~floating
         cells = mean_cells(lattice, points, index, inside, focal_px)
@@ -107,9 +109,12 @@ def relief_of(
         # What a metre of depth adds to the height: the ray rises, and so does the ground below it.
         rise = jnp.abs(z - surface.slope_x * x - surface.slope_y * y) / depth_m
         slope = _surface_slope(camera, R[2], disparity_px)
-        values = (height_m, rise * sigma_depth_m, slope, ground.roughness_m, ground.step_m, depth_m)
         known = inside & ground.seen & found
-        return Relief(*(jnp.where(known, value, 0.0) for value in values), known, floating, found)
+        of_known = [
+            jnp.where(known, value, 0.0)
+            for value in (height_m, rise * sigma_depth_m, slope, ground.roughness_m, ground.step_m, depth_m)
+        ]
+        return Relief(*of_known, known=known, floating=floating, found=found)
 
 
 def relief_channels(relief: Relief) -> Float[Array, "h w 6"]:
@@ -152,11 +157,11 @@ def block_means(disparity_px: Float[Array, "H W"], size: int) -> Float[Array, "h
     gather = jnp.asarray(np.repeat(np.eye(strip), size, axis=0), padded.dtype)
 
     def sums(values: list[Array]) -> Array:
-        rows = sum(values).reshape(height * strips, strip * size)
+        rows = sum(values[1:], start=values[0]).reshape(height * strips, strip * size)
         return jnp.dot(rows, gather, precision="highest").reshape(height, -1)[:, :width]
 
     lines = [padded[first::size] for first in range(size)]
-    known = [jnp.isfinite(line) for line in lines]
+    known = [jnp.abs(line) < _MOST_PX for line in lines]
     count = sums([there.astype(padded.dtype) for there in known])
     total = sums([jnp.where(there, line, 0.0) for there, line in zip(known, lines, strict=True)])
     return jnp.where(count >= size * size / 2, total / jnp.maximum(count, 1.0), jnp.nan)
@@ -175,13 +180,45 @@ def _coarse(camera: StereoCamera) -> StereoCamera:
     )
 
 
-def _farthest_below(depth_m: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """The greatest depth down the column, from each pixel on: the greatest of runs that double in length."""
-    farthest_m, run = depth_m, 1
-    while run < len(depth_m):
-        farthest_m = jnp.maximum(farthest_m, jnp.pad(farthest_m[run:], ((0, run), (0, 0))))
-        run *= 2
-    return farthest_m
+def _turned(R: Float[Array, "3 3"], x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
+    """Vectors in another frame; written out, as a product with so small a matrix is slow."""
+    return (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+
+
+def _farthest_below(
+    camera: StereoCamera, R: Float[Array, "3 3"], ground_m: Float[Array, "h w"], points: LevelPoints
+) -> Float[Array, "h w"]:
+    """The greatest of depths on the ground, 0 for none, that are seen straight below each point.
+
+    Verticals lean in a tilted image, and are columns of the one that a level camera sees; its rows begin at the
+    horizon.
+    """
+    height, width = ground_m.shape
+    focal_px, middle = jnp.sqrt(camera.fx_px * camera.fy_px), (width - 1) / 2
+    down, left = jnp.arange(height)[:, None] / focal_px, (middle - jnp.arange(width)) / focal_px
+    x, y, z = _turned(R.T, jnp.ones_like(left), left, -down)
+    z = jnp.maximum(z, 1e-3)
+    level_m = _nearest(ground_m, camera.fy_px * y / z + camera.cy_px, camera.fx_px * x / z + camera.cx_px)
+    farthest_m = jax.lax.cummax(level_m, axis=0, reverse=True)
+    # In all of three columns: the edge of a boulder shares its own with what is seen beside it.
+    padded = jnp.pad(farthest_m, ((0, 0), (1, 1)), mode="edge")
+    farthest_m = jnp.minimum(jnp.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
+    ahead_m = jnp.maximum(points.x_m, 1e-3)
+    row = jnp.maximum(-points.z_m / ahead_m * focal_px, 0.0)
+    return _nearest(farthest_m, row, middle - points.y_m / ahead_m * focal_px)
+
+
+def _nearest(image: Float[Array, "h w"], row: Float[Array, "*s"], column: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """The pixels nearest to places of an image; 0 outside."""
+    height, width = image.shape
+    row, column = jnp.round(row), jnp.round(column)
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    index = jnp.where(inside, row * width + column, 0.0).astype(jnp.int32)
+    return jnp.where(inside, jnp.take(image.reshape(-1), index, mode="clip"), 0.0)
 
 
 def _surface_slope(camera: StereoCamera, up_camera: Array, disparity_px: Array) -> Array:
@@ -205,7 +242,7 @@ def _surface_slope(camera: StereoCamera, up_camera: Array, disparity_px: Array) 
 
         def ends(image: Array) -> tuple[Array, Array]:
             padded = jnp.pad(image, [(2, 2) if axis == along else (0, 0) for along in (0, 1)], mode="edge")
-            return padded[: height, : width], padded[-height:, -width:]
+            return padded[:height, :width], padded[-height:, -width:]
 
         both = jnp.logical_and(*ends(count > 4))
         pairs = zip((ends(mean) for mean in means), instead, strict=True)
@@ -215,9 +252,9 @@ def _surface_slope(camera: StereoCamera, up_camera: Array, disparity_px: Array) 
     determinant = du * ev - dv * eu
     a, b = (dd * ev - ed * dv) / determinant, (ed * du - dd * eu) / determinant
     u, v, d = means
-    normal = (a * camera.fx_px, b * camera.fy_px, d - a * u - b * v)
-    upright = sum(component * up_camera[axis] for axis, component in enumerate(normal))
-    across = safe_sqrt(sum(component**2 for component in normal) - upright**2)
+    x, y, z = a * camera.fx_px, b * camera.fy_px, d - a * u - b * v
+    upright = x * up_camera[0] + y * up_camera[1] + z * up_camera[2]
+    across = safe_sqrt(x**2 + y**2 + z**2 - upright**2)
     return jnp.minimum(across / jnp.maximum(jnp.abs(upright), 1e-6), _STEEPEST)
 
 
