@@ -189,6 +189,7 @@ def bent(inputs, weights) -> jax.Array:
     return (relief_channels(relief) * weights).sum() + relief.roughness_m.sum() + relief.depth_m.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [*HOLES.values(), None], ids=[*HOLES.keys(), "nothing else"])
 def test_gradients_are_finite(kinds):
     rng = np.random.default_rng(8)
