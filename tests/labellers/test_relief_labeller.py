@@ -22,12 +22,12 @@ from jaxmap.errors import JaxmapError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.geometry.options import GroundOptions
-from jaxmap.labellers.base import Labeller, harden
+from jaxmap.labellers.base import Labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labellers.options import ReliefOptions
 from jaxmap.labellers.plane import make_plane_labeller
-from jaxmap.labellers.relief import combine_with_relief, make_relief_labeller, rock_log_odds
+from jaxmap.labellers.relief import GroundSeen, combine_with_relief, make_relief_labeller, rock_log_odds
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.models.checkpoint import SavedModel
@@ -41,8 +41,7 @@ GRID = make_grid([0, -4, -2], [8, 4, 1], 0.25)
 RANGE_M = (0.3, 8.0)
 FUSION = make_fusion_params(CLASSES, disparity_sigma_px=0.05)
 KEY = jax.random.key(1)
-COARSE = dict(range_m=8.0, cell_m=0.2)
-RELIEF = make_relief_labeller(CLASSES, **COARSE)
+RELIEF = make_relief_labeller(CLASSES, range_m=8.0, cell_m=0.2)
 HARD, SOFT = (make_files_labeller(CLASSES, soft=soft) for soft in (False, True))
 NUMBERS = RELIEF.params.numbers
 BOXES = (Box(3.0, -0.5, 1.0, 0.5), Box(4.5, 0.8, 0.9, 0.7))
@@ -51,7 +50,7 @@ BOXES = (Box(3.0, -0.5, 1.0, 0.5), Box(4.5, 0.8, 0.9, 0.7))
 @cache
 def scene(*, slopes: tuple[float, float] = (0.0, 0.0), boxes: tuple[Box, ...] = BOXES, rolling: bool = False) -> View:
     def waves(x, y):
-        return 0.12 * np.sin(1.1 * x) * np.cos(0.9 * y)
+        return 0.2 * np.sin(1.1 * x) * np.cos(0.9 * y)
 
     return view_of(slopes, boxes, bumps=waves if rolling else None, camera=CAMERA)
 
@@ -101,7 +100,7 @@ def test_hills_are_sand_where_the_plane_calls_them_rock(where):
     ours, planes = labelled(relief_alone, frame), labelled(plane_alone, frame)
     near = view.depth_m < 6
     seen = near & (ours != IGNORE)
-    assert seen.sum() > 0.7 * near.sum() and (ours[seen] == ROCK).mean() < 0.03
+    assert seen.sum() > 0.7 * near.sum() and (ours[seen] == ROCK).mean() < 0.05
     if where == "rolling ground":
         assert (planes[near] == ROCK).mean() > 0.1
 
@@ -126,7 +125,9 @@ def test_what_is_unknown_has_no_class_and_what_floats_is_left_out():
     assert (labels[4:12, 60:72] == IGNORE).all()
 
 
-@pytest.mark.parametrize("labeller_of", [relief_alone, plane_alone], ids=["relief", "plane"])
+@pytest.mark.parametrize(
+    "labeller_of", [relief_alone, pytest.param(plane_alone, marks=pytest.mark.slow)], ids=["relief", "plane"]
+)
 def test_the_estimate_of_a_frame_says_whether_there_is_ground(labeller_of):
     labeller, mapper = mapper_of(labeller_of)
     params = MapperParams(CAMERA, FUSION, labeller.params)
@@ -138,7 +139,8 @@ def test_the_estimate_of_a_frame_says_whether_there_is_ground(labeller_of):
     assert mapper.compilations() == 1
 
 
-def test_scan_equals_loop_and_jit_equals_eager():
+@pytest.mark.slow
+def test_scan_equals_loop():
     labeller, mapper = mapper_of(relief_alone)
     params = MapperParams(CAMERA, FUSION, labeller.params)
     frames = [frame_of(scene(), scene().disparity_px + np.float32(0.1 * shift)) for shift in range(2)]
@@ -166,14 +168,7 @@ def label_values(labeller: Labeller, own: np.ndarray, relief: np.ndarray, **numb
     combined = combine_with_relief(labeller)
     given_numbers = {**combined.params.numbers, **{name: jnp.float32(value) for name, value in numbers.items()}}
     values = jnp.asarray(np.concatenate([own, relief], axis=1), jnp.float32)
-    found = combined.estimate(_of_frame(), combined.params.numbers)
-    return np.stack(combined.label(values, found, given_numbers), axis=-1)
-
-
-def _of_frame():
-    from jaxmap.labellers.relief import GroundSeen
-
-    return GroundSeen(jnp.asarray(True))
+    return np.stack(combined.label(values, GroundSeen(jnp.asarray(True)), given_numbers), axis=-1)
 
 
 def shares_of(rng: np.random.Generator, count: int = 40) -> np.ndarray:
@@ -267,6 +262,7 @@ def test_further_numbers_of_pixels_follow_the_logits():
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_relief_can_be_tuned():
     rule = FusionRule(carve=False)
     recipe = CacheRecipe(CAMERA, GRID, RELIEF, rule, RANGE_M)
@@ -284,12 +280,3 @@ def test_relief_can_be_tuned():
     total, gradient = jax.value_and_grad(rock)(numbers)
     np.testing.assert_allclose(total, np.asarray(mapped.log_odds)[1 + ROCK].sum(), rtol=1e-3, atol=1e-2)
     assert all(np.isfinite(slope) and slope != 0 for slope in gradient.values())
-
-
-def test_hardened_labels_are_the_likeliest():
-    rng = np.random.default_rng(4)
-    from jaxmap.types import PointLabels
-
-    shares = label_values(SOFT, shares_of(rng), relief_values(rng, 1.0))
-    labels = harden(PointLabels(keep=jnp.ones(40, bool), probabilities=jnp.asarray(shares))).labels
-    assert set(np.unique(labels)) <= {*range(len(CLASSES)), IGNORE}
