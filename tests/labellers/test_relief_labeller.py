@@ -102,7 +102,7 @@ def test_hills_are_sand_where_the_plane_calls_them_rock(where):
     seen = near & (ours != IGNORE)
     assert seen.sum() > 0.7 * near.sum() and (ours[seen] == ROCK).mean() < 0.05
     if where == "rolling ground":
-        assert (planes[near] == ROCK).mean() > 0.1
+        assert (planes[near] == ROCK).mean() > 0.08
 
 
 def test_a_plane_steeper_than_its_greatest_tilt_is_not_found_and_a_slope_of_sand_is():
