@@ -221,12 +221,13 @@ def safe_sqrt(values: Float[Array, "*s"]) -> Float[Array, "*s"]:
 
 def _plane_through(weight: Array, x: Array, y: Array, z: Array) -> Incline:
     """The plane of least squares through weighted points, with its height at the origin."""
-    total = jnp.maximum(weight.sum(), _LEAST_MASS)
-    mean_x, mean_y, mean_z = (jnp.vdot(weight, values) / total for values in (x, y, z))
+
+    def mean(values: Array) -> Array:
+        return jnp.vdot(weight, values, precision="highest") / jnp.maximum(weight.sum(), _LEAST_MASS)
+
+    mean_x, mean_y, mean_z = mean(x), mean(y), mean(z)
     dx, dy, dz = x - mean_x, y - mean_y, z - mean_z
-    products = (dx * dx, dx * dy, dy * dy, dx * dz, dy * dz)
-    xx, xy, yy, xz, yz = (jnp.vdot(weight, values) / total for values in products)
-    slope_x, slope_y = _slopes(xx, xy, yy, xz, yz, 1e-6)
+    slope_x, slope_y = _slopes(mean(dx * dx), mean(dx * dy), mean(dy * dy), mean(dx * dz), mean(dy * dz), 1e-6)
     return Incline(mean_z - slope_x * mean_x - slope_y * mean_y, slope_x, slope_y)
 
 

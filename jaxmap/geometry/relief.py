@@ -141,7 +141,7 @@ def level_rotation(up_camera: Float[Array, "3"]) -> Float[Array, "3 3"]:
     up = up_camera / jnp.linalg.norm(up_camera)
     steep = jnp.abs(up[2]) > 0.999
     ahead = jnp.where(steep, jnp.array([0.0, -1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
-    ahead = ahead - (ahead @ up) * up
+    ahead = ahead - (ahead * up).sum() * up
     forward = ahead / jnp.linalg.norm(ahead)
     return jnp.stack([forward, jnp.cross(up, forward), up])
 
