@@ -46,7 +46,7 @@ class ReliefOptions(GroundOptions):
     slope_gain arctan(slope)`. The defaults were fitted on simulated pairs of other worlds than those it is tried on.
     """
 
-    combine: bool = False
+    combine: Annotated[bool, tyro.conf.arg(aliases=["--relief"])] = False
     """Add relief to the labels of a network or of files; --relief for short."""
     bias: float = -2.7
     """Log-odds of rock on level ground of middling height."""
