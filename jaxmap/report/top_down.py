@@ -158,7 +158,8 @@ def draw(
     anchor: dict[str, Any] = dict(
         loc="upper left", bbox_to_anchor=(_LEFT_PX / width, legend_px / height), ncols=columns
     )
-    figure.legend(handles, names, **anchor, frameon=False, fontsize=_TEXT, labelcolor=INK, **spacing)
+    if layout.with_legend:
+        figure.legend(handles, names, **anchor, frameon=False, fontsize=_TEXT, labelcolor=INK, **spacing)
     _draw_scale(axes, (width - _RIGHT_PX, legend_px), _nice(0.11 * map_width / px_per_m), north=sheet.georeferenced)
     if sheet.bar:
         _draw_bar(figure.add_axes((_LEFT_PX / width, 54 / height, 400 / width, 18 / height)), sheet.bar)
