@@ -102,7 +102,7 @@ def _map_and_score(out: Path, name: str, config: MapConfig, truth: Path, console
     plan = plan_run(SAMPLE, config, console.notify)
     with folder.locked():
         folder.begin(plan.settings(config), resume=False, overwrite=True)
-        metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify)
+        metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify, report=False)
     evaluation, layer = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
     backdrop = read_backdrop(truth / "orthomosaic.tif", evaluation, layer)
     write_evaluation(folder.scores, folder.errors, evaluation, backdrop)

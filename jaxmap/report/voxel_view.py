@@ -246,14 +246,16 @@ def _scene(points_world: Float[np.ndarray, "N 3"], path_world: Float[np.ndarray,
     span_m = np.maximum(high - low, 1e-2)
     longest_m = span_m[:2].max()
     turn = np.deg2rad(-66.0 if span_m[0] >= span_m[1] else -24.0)
-    slant, distance = np.deg2rad(36.0), 1.75
+    slant, distance = np.deg2rad(36.0), 1.5
     across = np.array([np.cos(turn), np.sin(turn), 0.0])
     steps_m = np.diff(path_world[:, :2], axis=0)
     way_m, length_m = steps_m.sum(axis=0), np.linalg.norm(steps_m, axis=-1).sum()
     if np.linalg.norm(way_m) > max(0.5 * length_m, 0.5):
         across = np.append(-way_m / np.linalg.norm(way_m), 0.0)
-    # What is near looks larger: looking a little before the middle fills the view evenly.
-    centre = 0.24 * across
+    # What is near looks larger: looking at the ground a little before the middle fills the view evenly.
+    centre = 0.25 * across
+    if len(points_world):
+        centre[2] = 1.6 * (np.median(points_world[:, 2]) - (low[2] + high[2]) / 2) / longest_m
     eye = centre + distance * (np.cos(slant) * across + np.sin(slant) * np.array([0.0, 0.0, 1.0]))
     axes = {
         f"{axis}axis": dict(visible=False, range=[float(low[i]), float(low[i] + span_m[i])])
