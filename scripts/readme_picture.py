@@ -2,8 +2,8 @@
 
     python scripts/readme_picture.py [RUN]
 
-RUN is a run of sample:traverse; without it the traverse is mapped first, as the last row of `jaxmap demo` but in cubes
-of `VOXEL_M`, which takes a minute.
+RUN is the run folder of the last row of `jaxmap demo` (jaxmap_demo/relief_deeplab); without it the traverse is mapped
+first, which takes a minute.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,6 @@ from jaxmap.report.run_page import RunContents, read_run
 from jaxmap.runs.config import config_tree
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "traverse.png"
-VOXEL_M = 0.05
 FRAME = "000004"
 EYE_AZIMUTH_DEG, EYE_ELEVATION_DEG = -45.0, 33.0
 """Where the map is seen from in 3D: from behind the rover, east by north."""
@@ -120,9 +118,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = run or Path(name) / "run"
         if run is None:
-            _, config = demo_rows()["relief_deeplab"]
-            config = replace(config, grid=replace(config.grid, voxel_size_m=VOXEL_M))
-            write_yaml(Path(name) / "config.yaml", config_tree(config))
+            write_yaml(Path(name) / "config.yaml", config_tree(demo_rows()["relief_deeplab"][1]))
             jaxmap_main(["map", SAMPLE, "--out", str(folder), "--config", str(Path(name) / "config.yaml")])
         draw(read_run(folder)).savefig(Path(name) / "picture.png")
         Image.open(Path(name) / "picture.png").convert("RGB").quantize(256).save(PICTURE, optimize=True)

@@ -114,11 +114,9 @@ def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None
         **changes: fields of `ReliefOptions` that differ from it.
 
     Raises:
-        JaxmapError: it sees relief itself, has no class of rock, or a number is out of bounds.
+        JaxmapError: it has no class of rock, or a number is out of bounds.
     """
     options = replace(options or ReliefOptions(), **changes)
-    if labeller.ground is not None:
-        raise JaxmapError(f"the {labeller.name} labeller sees relief already", where="relief", fix="leave --relief out")
     classes = labeller.classes
     (rock,) = _indices(classes, options, (options.rock,))
     bijectors = {**_BIJECTORS, **_COMBINED}

@@ -37,9 +37,11 @@ class SeenFrame:
 def image_colours(points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenFrame]) -> UInt8[np.ndarray, "N 3"]:
     """The colours of points in the nearest frame that sees them, brightened alike so that the brightest are bright.
 
-    A point hides those well behind it in the same block of pixels. Points that no frame sees are grey.
+    A point hides those well behind it in the same block of pixels. Points that no frame sees take the colour of the
+    nearest point that one sees; all are grey where no point is seen.
     """
     from PIL import Image, ImageFilter
+    from scipy.spatial import KDTree
 
     points_world = np.asarray(points_world, np.float64).reshape(-1, 3)
     colours = np.zeros((len(points_world), 3))
@@ -52,9 +54,10 @@ def image_colours(points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenF
         colours[seen] = smooth[row[seen], column[seen]]
         nearest_m[seen] = depth_m[seen]
     known = np.isfinite(nearest_m)
-    if known.any():
-        colours[known] *= _BRIGHT / max(float(np.percentile(colours[known].max(axis=-1), 98)), 1.0)
-    colours[~known] = _UNSEEN
+    if not known.any():
+        return np.full(colours.shape, _UNSEEN, np.uint8)
+    colours[~known] = colours[known][KDTree(points_world[known]).query(points_world[~known])[1]]
+    colours *= _BRIGHT / max(float(np.percentile(colours.max(axis=-1), 98)), 1.0)
     return np.rint(colours.clip(0, 255)).astype(np.uint8)
 
 

@@ -115,7 +115,7 @@ def draw(
     margin_m = np.ceil(np.maximum(0.04 * (high_m - low_m).max(), sheet.cell_m) / sheet.cell_m) * sheet.cell_m
     low_m, high_m = low_m - margin_m, high_m + margin_m
     px_per_m = layout.map_px / (high_m - low_m).max()
-    if px_per_m * sheet.cell_m.min() > 2:
+    if px_per_m * sheet.cell_m.min() > 4:
         px_per_m = np.floor(px_per_m * sheet.cell_m.min()) / sheet.cell_m.min()
     map_width, map_height = (max(1, round(span * px_per_m)) for span in high_m - low_m)
 
@@ -124,7 +124,10 @@ def draw(
     columns = int((0.75 * width - _LEFT_PX - _RIGHT_PX - 110) // (15 * max(map(len, names)) + 75))
     columns = min(max(columns, 1), len(names))
     legend_px = max(38 * -(-len(names) // columns) + (104 if sheet.bar else 0), 60) + 24
-    title = sheet.title if layout.with_legend else ""
+    title, scale_px = sheet.title, legend_px
+    if not layout.with_legend:
+        # The scale stands beside the name of the axis.
+        title, legend_px, scale_px = "", 0, 70
     height = map_height + _BELOW_PX + legend_px + (84 if title else 40)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     left = _LEFT_PX + (width - _LEFT_PX - _RIGHT_PX - map_width) // 2
@@ -158,8 +161,9 @@ def draw(
     anchor: dict[str, Any] = dict(
         loc="upper left", bbox_to_anchor=(_LEFT_PX / width, legend_px / height), ncols=columns
     )
-    figure.legend(handles, names, **anchor, frameon=False, fontsize=_TEXT, labelcolor=INK, **spacing)
-    _draw_scale(axes, (width - _RIGHT_PX, legend_px), _nice(0.11 * map_width / px_per_m), north=sheet.georeferenced)
+    if layout.with_legend:
+        figure.legend(handles, names, **anchor, frameon=False, fontsize=_TEXT, labelcolor=INK, **spacing)
+    _draw_scale(axes, (width - _RIGHT_PX, scale_px), _nice(0.11 * map_width / px_per_m), north=sheet.georeferenced)
     if sheet.bar:
         _draw_bar(figure.add_axes((_LEFT_PX / width, 54 / height, 400 / width, 18 / height)), sheet.bar)
     with atomic_path(path) as temporary:

@@ -129,7 +129,7 @@ def voxel_view(
             intensitymode="cell",
             flatshading=True,
             # Without an epsilon of 0 plotly takes faces as small as these for degenerate, and leaves them unlit.
-            lighting=dict(ambient=0.55, diffuse=0.6, specular=0.03, roughness=0.9, fresnel=0.0)
+            lighting=dict(ambient=0.65, diffuse=0.5, specular=0.03, roughness=0.9, fresnel=0.0)
             | dict(facenormalsepsilon=0, vertexnormalsepsilon=0),
             lightposition=dict(x=-6e4, y=-2e4, z=1e5),
             hovertemplate="east %{x:.1f} m, north %{y:.1f} m, height %{z:.1f} m<extra></extra>",
@@ -137,7 +137,7 @@ def voxel_view(
         )
     _add_path(figure, path_world)
     figure.update_layout(
-        scene=_scene(np.concatenate([corners_world.astype(np.float64), path_world])),
+        scene=_scene(np.concatenate([corners_world.astype(np.float64), path_world]), path_world),
         margin=dict(l=0, r=0, t=0, b=0),
         paper_bgcolor="rgba(0,0,0,0)",
         showlegend=False,
@@ -237,16 +237,25 @@ def _add_path(figure: Figure, path_world: Float[np.ndarray, "N 3"]) -> None:
     )
 
 
-def _scene(points_world: Float[np.ndarray, "N 3"]) -> dict[str, Any]:
-    """A scene of equal metres on all axes, seen at a slant across its shorter side."""
+def _scene(points_world: Float[np.ndarray, "N 3"], path_world: Float[np.ndarray, "P 3"]) -> dict[str, Any]:
+    """A scene of equal metres on all axes, seen at a slant from behind the rover, as it saw the faces of rocks.
+
+    Without a path, or with one that turns back, it is seen across its shorter side.
+    """
     low, high = (points_world.min(axis=0), points_world.max(axis=0)) if len(points_world) else (-np.ones(3), np.ones(3))
     span_m = np.maximum(high - low, 1e-2)
     longest_m = span_m[:2].max()
     turn = np.deg2rad(-66.0 if span_m[0] >= span_m[1] else -24.0)
-    slant, distance = np.deg2rad(40.0), 1.9
+    slant, distance = np.deg2rad(36.0), 1.5
     across = np.array([np.cos(turn), np.sin(turn), 0.0])
-    # What is near looks larger: looking a little before the middle fills the view evenly.
-    centre = 0.16 * across
+    steps_m = np.diff(path_world[:, :2], axis=0)
+    way_m, length_m = steps_m.sum(axis=0), np.linalg.norm(steps_m, axis=-1).sum()
+    if np.linalg.norm(way_m) > max(0.5 * length_m, 0.5):
+        across = np.append(-way_m / np.linalg.norm(way_m), 0.0)
+    # What is near looks larger: looking at the ground a little before the middle fills the view evenly.
+    centre = 0.25 * across
+    if len(points_world):
+        centre[2] = 1.6 * (np.median(points_world[:, 2]) - (low[2] + high[2]) / 2) / longest_m
     eye = centre + distance * (np.cos(slant) * across + np.sin(slant) * np.array([0.0, 0.0, 1.0]))
     axes = {
         f"{axis}axis": dict(visible=False, range=[float(low[i]), float(low[i] + span_m[i])])

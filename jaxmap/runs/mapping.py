@@ -32,6 +32,7 @@ def run_plan(
     notify: Notify,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
     profile: bool = False,
+    report: bool = True,
 ) -> dict[str, Any]:
     """Maps the sequence and writes all outputs.
 
@@ -46,6 +47,7 @@ def run_plan(
         notify: takes lines for the user.
         on_frame: called after each frame.
         profile: record a trace of some steps into the folder, and report where their time went.
+        report: write the page of the run.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -70,6 +72,7 @@ def run_plan(
     )
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
     run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form)
+    key_frames: list[tuple[PreparedFrame, int]] = []
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
@@ -83,23 +86,24 @@ def run_plan(
                 step_profile.step_done()
             on_frame(fused)
             if fused.info is not None and fused.prepared.index in plan.key_frames:
-                started_s = time.perf_counter()
-                _write_key_frame(plan, folder, fused.prepared, int(voxel_map.frames_fused) - 1)
-                # Pictures are no part of the pipeline that is timed.
-                resumed_s += time.perf_counter() - started_s
+                # Pictures are no part of the pipeline that is timed, and wait for the next save.
+                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
+                _write_key_frames(plan, folder, key_frames)
                 save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
             save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
+            _write_key_frames(plan, folder, key_frames)
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
         step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
+    _write_key_frames(plan, folder, key_frames)
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
@@ -111,6 +115,8 @@ def run_plan(
             f"note: no ground below the camera in {log.without_ground} of {log.fused} frames: nothing there is sand or "
             "rock by its shape; check that the poses are of the left camera in a z-up world"
         )
+    if report:
+        write_report(folder.path)
     if not metrics["voxels"]["occupied"]:
         notify("note: no voxel is occupied: check the bounds, the range and the poses")
     return metrics
@@ -131,7 +137,6 @@ def _write_outputs(
     write_exports(folder, voxel_map, attributes)
     metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map) | details
     write_json(folder.metrics, metrics)
-    write_report(folder.path)
     return metrics
 
 
@@ -187,13 +192,15 @@ def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
     )
 
 
-def _write_key_frame(plan: Plan, folder: RunFolder, prepared: PreparedFrame, number: int) -> None:
-    """Pictures of one frame, with the labels that the step gave it as the `number`-th."""
-    assert prepared.frame is not None and prepared.rectified is not None
-    labels = None
-    if plan.labeller.classes:
-        labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
-    write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
+def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[PreparedFrame, int]]) -> None:
+    """Writes pictures of frames, with the labels that the step gave each as the so manieth, and empties the list."""
+    for prepared, number in key_frames:
+        assert prepared.frame is not None and prepared.rectified is not None
+        labels = None
+        if plan.labeller.classes:
+            labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
+        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
+    key_frames.clear()
 
 
 def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:

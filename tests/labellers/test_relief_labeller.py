@@ -219,12 +219,10 @@ def test_extreme_numbers_leave_probabilities():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: combine_with_relief(RELIEF), "the relief labeller sees relief already"),
-        (lambda: combine_with_relief(network_labeller()), "the deeplab labeller sees relief already"),
         (lambda: make_relief_labeller(("sand",)), "the class 'rock' is not one of"),
         (lambda: make_relief_labeller(CLASSES, softness_m=0.0), "relief.softness_m is 0.0"),
     ],
-    ids=["relief itself", "a network that sees it", "no rock", "out of bounds"],
+    ids=["no rock", "out of bounds"],
 )
 def test_what_cannot_be_is_refused(make, says):
     with pytest.raises(JaxmapError, match=says):
