@@ -318,11 +318,11 @@ def test_the_front_end_of_a_plan_sees_the_true_depth(scene_folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("z_up", [True, False], ids=["z-up", "the first camera as the world"])
+@pytest.mark.parametrize("z_up", [True, False], ids=["z up", "z down"])
 def test_a_run_says_in_how_many_frames_it_found_no_ground(z_up, scene_copy, tmp_path):
     if not z_up:
         track = read_poses(scene_copy / "poses.tum")
-        write_tum(scene_copy / "poses.tum", track.timestamps_s, np.linalg.inv(track.T[0]) @ track.T)
+        write_tum(scene_copy / "poses.tum", track.timestamps_s, np.diag([1.0, -1.0, -1.0, 1.0]) @ track.T)
     config, lines = config_of(labeller="relief", stop=2), []
     plan = plan_run(str(scene_copy), config, lines.append)
     folder = RunFolder(tmp_path / "run")
