@@ -36,7 +36,8 @@ class StereoOptions:
     block_size: Annotated[int, Positive] = 7
     """Edge of the matched block, odd."""
     p1: Annotated[int, Positive] | None = None
-    """Penalty for a disparity step of one; by default 16 block_size^2, twice what OpenCV suggests: sand has little texture."""
+    """Penalty for a disparity step of one; by default 16 block_size^2, twice what OpenCV suggests: sand has little
+    texture."""
     p2: Annotated[int, Positive] | None = None
     """Penalty for a greater step; by default 64 block_size^2."""
     pre_filter_cap: Annotated[int, Interval(ge=15, le=63)] = 31
@@ -51,7 +52,7 @@ class StereoOptions:
     speckle_range_px: Annotated[int, NotNegative] = 2
     """Disparity step that ends a blob."""
     edge_step_px: Annotated[float, NotNegative] = 1.5
-    """Pixels near a greater step of disparity are dropped: there, blocks smear rocks over the ground behind them; 0 keeps
+    """Pixels near a greater step of disparity are dropped: there, blocks smear rocks over the ground behind; 0 keeps
     them."""
     edge_window_px: Annotated[int, Positive] = 7
     """Edge of the square, odd, that is near."""
