@@ -127,7 +127,7 @@ def draw(
     title, scale_px = sheet.title, legend_px
     if not layout.with_legend:
         # The scale stands beside the name of the axis.
-        title, legend_px, scale_px = "", 0, 70
+        title, legend_px, scale_px = "", 0, 84
     height = map_height + _BELOW_PX + legend_px + (84 if title else 40)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     left = _LEFT_PX + (width - _LEFT_PX - _RIGHT_PX - map_width) // 2

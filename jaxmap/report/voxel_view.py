@@ -253,7 +253,7 @@ def _scene(points_world: Float[np.ndarray, "N 3"], path_world: Float[np.ndarray,
     if np.linalg.norm(way_m) > max(0.5 * length_m, 0.5):
         across = np.append(-way_m / np.linalg.norm(way_m), 0.0)
     # What is near looks larger: looking at the ground a little before the middle fills the view evenly.
-    centre = 0.25 * across
+    centre = 0.3 * across
     if len(points_world):
         centre[2] = 1.6 * (np.median(points_world[:, 2]) - (low[2] + high[2]) / 2) / longest_m
     eye = centre + distance * (np.cos(slant) * across + np.sin(slant) * np.array([0.0, 0.0, 1.0]))
