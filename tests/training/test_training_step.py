@@ -246,10 +246,10 @@ def test_two_devices_come_to_the_weights_of_one(tmp_path):
 def test_mobilenet_learns_too():
     """The real backbone, in the least network around it, without the stand-in."""
     from jaxmap.models import deeplab
-    from jaxmap.models.backbones import MobileNetV2
+    from jaxmap.models.backbones import InvertedResidualNet
 
     backbones: dict = deeplab._BACKBONES
-    stand_in, backbones["mobilenet_v2"] = backbones["mobilenet_v2"], MobileNetV2
+    stand_in, backbones["mobilenet_v2"] = backbones["mobilenet_v2"], InvertedResidualNet
     deeplab.weight_shapes.cache_clear()
     try:
         record = replace(ARCHITECTURE, decoder=True, top_conv=False)
