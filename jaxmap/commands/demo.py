@@ -45,13 +45,9 @@ class DemoArguments:
 
 def demo_rows() -> dict[str, tuple[str, MapConfig]]:
     """The rows: run folder name, then the name of the map and its settings."""
-    from jaxmap.host.files import bundled
-    from jaxmap.models.checkpoint import load_network
-
-    sees_relief = load_network(bundled("rover.safetensors")).architecture.relief_channels > 0
     # In cubes, the shapes of rocks are seen in 3D.
     paper, ours = load_config("chiodini2020"), MapConfig(grid=GridOptions(voxel_size_m=VOXEL_M))
-    both = replace(ours, labeller="deeplab", relief=ReliefOptions(combine=not sees_relief))
+    both = replace(ours, labeller="deeplab", relief=ReliefOptions(combine=True))
     rows = {
         "plane_chiodini2020": ("MLESAC plane (paper)", replace(paper, labeller="plane")),
         "deeplab_chiodini2020": ("DeepLabv3+ (paper)", replace(paper, labeller="deeplab")),

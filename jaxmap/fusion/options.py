@@ -87,7 +87,7 @@ class FusionOptions(FusionRule):
     occupancy_threshold: Annotated[float, Probability] = 0.5
     """A voxel is occupied above this probability."""
     class_threshold: Annotated[float, Probability] | None = None
-    """A priority class wins above this probability; by default above its prior, where more speaks for it than against."""
+    """A priority class wins above this probability; by default above its prior: more speaks for it than against."""
     class_kernel: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     """One odd square a class: how much of the evidence of neighbouring columns counts when the map is read; tune
     --kernel learns it."""
@@ -107,9 +107,9 @@ class FusionOptions(FusionRule):
                     fix="name classes of the map, or none",
                 )
         choices: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(FusionRule)}
-        return FusionRule(
-            **choices | {name: tuple(classes[index] for index in indices) for name, indices in chosen.items()}
-        )
+        for name, indices in chosen.items():
+            choices[name] = tuple(classes[index] for index in indices)
+        return FusionRule(**choices)
 
     def priors(self, classes: Sequence[str]) -> Any:
         """The prior of each class, or what stands for them."""

@@ -1,8 +1,8 @@
 """The inverse sensor model: what the points of one frame say about each voxel.
 
 All evidence is additive over frames. The filter is `l_j = l_{j-1} + logit p(m|z_j) - logit p(m)`
-(paper eq. 3 with the standard sign; both signs agree at the paper's prior of 0.5). The increments of classes are what an
-observation adds, the prior already taken away.
+(paper eq. 3 with the standard sign; both signs agree at the paper's prior of 0.5). The increments of classes
+are what an observation adds, the prior already taken away.
 """
 
 from __future__ import annotations

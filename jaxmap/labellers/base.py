@@ -31,9 +31,7 @@ Pointwise = Callable[[Float[Array, "N D *w"]], tuple[Shaped[Array, "N *w"], ...]
 class FeatureMap(Protocol):
     """`PointFeatures.map`."""
 
-    def __call__(
-        self, function: Pointwise, more: Float[Array, "N E"] | None = None
-    ) -> tuple[Shaped[Array, "N"], ...]:
+    def __call__(self, function: Pointwise, more: Float[Array, "N E"] | None = None) -> tuple[Shaped[Array, "N"], ...]:
         """Applies the function."""
         ...
 

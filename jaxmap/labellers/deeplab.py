@@ -18,7 +18,7 @@ from jaxmap.geometry.options import GroundOptions
 from jaxmap.geometry.relief import relief_channels
 from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, Pointwise
 from jaxmap.labellers.options import DeeplabOptions
-from jaxmap.labellers.relief import floating_points
+from jaxmap.labellers.relief import floating_points, ground_seen
 from jaxmap.labels import IGNORE
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import fold_batch_norm, pure_network
@@ -83,11 +83,10 @@ def make_deeplab_labeller(
 ) -> Labeller:
     """Labels by a network that sees the rectified left image inside the step.
 
-    Without relief, the labels are those of `jaxmap segment` with the same model and size. A network that was trained
-    with relief sees that of the frame as well. A pixel's point is kept
-    whatever its class: what the network gives to classes that the map has not is evidence that
-    something is there, and for no class. Logits are divided by the temperature before the softmax
-    (Guo et al. 2017, "On Calibration of Modern Neural Networks").
+    The labels are those of `jaxmap segment` with the same model and size; a network that was trained with relief sees
+    that of the frame as well, and leaves out false matches in the air. A pixel's point is kept whatever its class: what
+    the network gives to classes that the map has not is evidence that something is there, and for no class. Logits are
+    divided by the temperature before the softmax (Guo et al. 2017, "On Calibration of Modern Neural Networks").
 
     Args:
         saved: the network; its batch norm is folded. Its weights become the labeller's params.
@@ -104,7 +103,7 @@ def make_deeplab_labeller(
             f"there is only a backbone ({saved.architecture.backbone})", where=_WHERE, fix="train a network from it"
         )
     mapped = map_classes(saved.architecture.classes, classes, options.class_map)
-    ground = GroundOptions() if saved.architecture.relief_channels else None
+    ground = GroundOptions() if saved.architecture.relief_channels and options.relief else None
     network = pure_network(*fold_batch_norm(saved.architecture, jax.tree.map(np.asarray, saved.weights)))
     groups = [
         [index for index, target in enumerate(mapped.targets) if target == wanted]
@@ -113,9 +112,10 @@ def make_deeplab_labeller(
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
         image, keep = _image(frame), cloud.in_range.reshape(-1)
-        relief = None
+        relief, of_frame = None, ()
         if ground is not None:
             assert cloud.relief is not None
+            of_frame = ground_seen(cloud)
             relief, keep = relief_channels(cloud.relief)[None], keep & ~floating_points(cloud)
         with jax.named_scope("network"):
             coarse = network.apply_coarse(params.weights, resized_input(image[None], options.size_px), relief)[0]
@@ -126,7 +126,7 @@ def make_deeplab_labeller(
             with jax.named_scope("pixel_labels"):
                 return tuple(image.reshape(-1) for image in map_pixels(function, coarse, places, more))
 
-        return PointFeatures(keep, map_rows)
+        return PointFeatures(keep, map_rows, of_frame)
 
     def label(logits: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
         if options.soft:

@@ -46,7 +46,7 @@ class ReliefOptions(GroundOptions):
     slope_gain arctan(slope)`. The defaults were fitted on simulated pairs of other worlds than those it is tried on.
     """
 
-    combine: bool = False
+    combine: Annotated[bool, tyro.conf.arg(aliases=["--relief"])] = False
     """Add relief to the labels of a network or of files; --relief for short."""
     bias: float = -2.7
     """Log-odds of rock on level ground of middling height."""
@@ -62,8 +62,8 @@ class ReliefOptions(GroundOptions):
     """Change of the log-odds for each radian of slope."""
     weight: Annotated[float, NotNegative] = 1.0
     """Share of relief's log-odds that is added to those of other labels."""
-    offset: float = 1.5
-    """Added to relief's log-odds there: other labels know already that rocks are few."""
+    offset: float = 0.0
+    """Added to relief's log-odds there."""
     label_gain: Annotated[float, NotNegative] = 1.0
     """Factor on the log-odds of the other labels."""
     certainty: Annotated[float, Interval(gt=0, lt=1)] = 0.9
@@ -103,5 +103,7 @@ class DeeplabOptions:
     """Height and width that the network runs at; those of the images without it."""
     soft: bool = True
     """Fuse the probabilities of all classes, not only the likeliest class."""
+    relief: bool = True
+    """Show relief to a network that was trained to see it; without, it labels by the image alone."""
     temperature: Annotated[float, Positive] = 1.0
     """Divides the logits: above 1 the probabilities are softer."""

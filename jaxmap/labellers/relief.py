@@ -8,24 +8,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.bijectors import Bijector, between, positive
 from jaxmap.geometry.cloud import PointCloud
-from jaxmap.geometry.relief import RELIEF_STRIDE
+from jaxmap.geometry.relief import RELIEF_STRIDE, box_sums
 from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, Pointwise
 from jaxmap.labellers.options import ReliefOptions
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, to_device
 
+
+class GroundSeen(NamedTuple):
+    """Of a frame: whether there is ground below the camera, and the estimate of the labels that relief is added to."""
+
+    found: Bool[Array, ""]
+    own: PyTree = ()
+
+
 _FEATURES = 4
 """Height, sigma, angle of the slope, and whether they are known."""
+
+_MOST_LOG_ODDS = 50.0
+"""Beyond, exponentials would overflow."""
 
 _BIJECTORS: dict[str, Bijector] = {
     "bias": between(-20.0, 20.0),
@@ -45,7 +56,8 @@ _COMBINED: dict[str, Bijector] = {
 def make_relief_labeller(classes: Sequence[str], options: ReliefOptions | None = None, **changes: Any) -> Labeller:
     """Labels by height above the local ground and by slope, both weighed against their noise.
 
-    Points whose relief is unknown have no class; false matches in the air are left out.
+    Points whose relief is unknown have no class; false matches in the air are left out. The labeller's estimate of a
+    frame says whether there is ground (`GroundSeen`).
 
     Args:
         classes: the map's classes, with `ground` and `rock` among them.
@@ -69,7 +81,7 @@ def make_relief_labeller(classes: Sequence[str], options: ReliefOptions | None =
                 for image in function(values.reshape(-1, _FEATURES))
             )
 
-        return PointFeatures(cloud.in_range.reshape(-1) & ~floating_points(cloud), map_coarse)
+        return PointFeatures(cloud.in_range.reshape(-1) & ~floating_points(cloud), map_coarse, ground_seen(cloud))
 
     def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
         known = values[:, 3]
@@ -91,7 +103,7 @@ def make_relief_labeller(classes: Sequence[str], options: ReliefOptions | None =
 
 
 def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None, **changes: Any) -> Labeller:
-    """Adds relief to the labels of another labeller: its probability of rock is multiplied by relief's likelihood ratio.
+    """Adds relief to the labels of another labeller: its odds of rock are multiplied by relief's likelihood ratio.
 
     The log-odds of relief, times `weight` and with `offset` added, are added to those of rock against each other
     class; where relief is unknown, labels stay as they are. Labels without probabilities are right with `certainty`.
@@ -102,30 +114,28 @@ def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None
         **changes: fields of `ReliefOptions` that differ from it.
 
     Raises:
-        JaxmapError: it sees relief itself, has no class of rock, or a number is out of bounds.
+        JaxmapError: it has no class of rock, or a number is out of bounds.
     """
     options = replace(options or ReliefOptions(), **changes)
-    if labeller.ground is not None:
-        raise JaxmapError(
-            f"the {labeller.name} labeller sees relief already", where="relief", fix="leave --relief out"
-        )
     classes = labeller.classes
     (rock,) = _indices(classes, options, (options.rock,))
     bijectors = {**_BIJECTORS, **_COMBINED}
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
         inner = labeller.features(frame, cloud, params, key)
-        more = _to_pixels(_coarse_features(cloud), cloud.depth_m.shape).reshape(-1, _FEATURES)
+        relief = _to_pixels(_coarse_features(cloud), cloud.depth_m.shape).reshape(-1, _FEATURES)
 
-        def map_both(function: Pointwise, further: Array | None = None) -> tuple[Array, ...]:
-            assert further is None
-            return inner.map(function, more)
+        def map_both(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
+            return inner.map(function, relief if more is None else jnp.concatenate([relief, more], axis=1))
 
-        return PointFeatures(inner.keep & ~floating_points(cloud), map_both, inner.of_frame)
+        return PointFeatures(inner.keep & ~floating_points(cloud), map_both, ground_seen(cloud, inner.of_frame))
 
-    def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
+    def estimate(of_frame: GroundSeen, numbers: Numbers) -> GroundSeen:
+        return of_frame._replace(own=labeller.estimate(of_frame.own, numbers))
+
+    def label(values: Array, estimate: GroundSeen, numbers: Numbers) -> tuple[Array, ...]:
         own, relief = values[:, :-_FEATURES], values[:, -_FEATURES:]
-        given = labeller.label(own, estimate, numbers)
+        given = labeller.label(own, estimate.own, numbers)
         if labeller.soft:
             shares = list(given)
         else:
@@ -136,7 +146,7 @@ def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None
                 for index in range(len(classes))
             ]
         ratio = numbers["weight"] * (rock_log_odds(relief, numbers) + numbers["offset"])
-        odds = jnp.exp(jnp.where(relief[:, 3] > 0, ratio, 0.0))
+        odds = jnp.exp(jnp.where(relief[:, 3] > 0, ratio, 0.0).clip(-_MOST_LOG_ODDS, _MOST_LOG_ODDS))
         gain = numbers["label_gain"]
         total = sum(shares)
         powers = [jnp.maximum(share, 1e-7) ** gain for share in shares]
@@ -144,10 +154,16 @@ def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None
         scale = total / sum(powers)
         return tuple(power * scale for power in powers)
 
+    def keep(values: Array, estimate: GroundSeen) -> tuple[Array]:
+        assert labeller.keep is not None
+        return labeller.keep(values[:, :-_FEATURES], estimate.own)
+
     numbers = {**labeller.params.numbers, **_numbers(options, bijectors)}
     return labeller._replace(
         features=features,
         label=label,
+        estimate=estimate,
+        keep=None if labeller.keep is None else keep,
         params=labeller.params._replace(numbers=numbers),
         bijectors={**labeller.bijectors, **bijectors},
         soft=True,
@@ -170,21 +186,20 @@ def floating_points(cloud: PointCloud) -> Bool[Array, "N"]:
     return _to_pixels(cloud.relief.floating, cloud.depth_m.shape).reshape(-1)
 
 
+def ground_seen(cloud: PointCloud, own: PyTree = ()) -> GroundSeen:
+    """What of a frame is known from its relief, beside other features of the whole frame."""
+    assert cloud.relief is not None
+    return GroundSeen(cloud.relief.found, own)
+
+
 def _coarse_features(cloud: PointCloud) -> Float[Array, "h w 4"]:
     relief = cloud.relief
     assert relief is not None
     known = relief.known.astype(relief.height_m.dtype)
     # The mean of the known heights around: half of the noise is gone, and edges of rocks are hardly moved.
-    mass = _box(known)
-    height_m = _box(relief.height_m * known) / jnp.maximum(mass, 1.0)
+    mass = box_sums(known)
+    height_m = box_sums(relief.height_m * known) / jnp.maximum(mass, 1.0)
     return jnp.stack([height_m, relief.sigma_m, jnp.arctan(relief.slope), known], axis=-1)
-
-
-def _box(field: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Sums of three by three."""
-    padded = jnp.pad(field, 1)
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
 
 
 def _to_pixels(coarse: Array, shape: tuple[int, ...]) -> Array:
@@ -206,4 +221,3 @@ def _indices(classes: Sequence[str], options: ReliefOptions, names: tuple[str, .
 
 def _numbers(options: ReliefOptions, bijectors: dict[str, Bijector]) -> Numbers:
     return {name: to_device(getattr(options, name), np.float32) for name in bijectors}
-

@@ -136,9 +136,7 @@ def label_image(
     """The labels that the step gives the pixels of the frame when `number` frames were fused before it."""
     frame_key = jax.random.fold_in(key, number)
     sigma_px, ground = params.fusion.disparity_sigma_px, design.labeller.ground
-    cloud = project(
-        params.camera, frame.T_world_camera, frame.disparity_px, design.depth_range_m, sigma_px, ground
-    )
+    cloud = project(params.camera, frame.T_world_camera, frame.disparity_px, design.depth_range_m, sigma_px, ground)
     labels = harden(label_points(design.labeller, frame, cloud, params.labeller, frame_key)[0])
     assert labels.labels is not None
     return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(frame.disparity_px.shape)

@@ -24,7 +24,7 @@ class MapConfig(ReadOptions):
     """Everything that decides what a map comes out as."""
 
     labeller: LabellerName = "plane"
-    """What labels the points: the MLESAC plane, relief above the local ground, a network, files of labels, or nothing."""
+    """What labels the points: the MLESAC plane, relief above the local ground, a network, files, or nothing."""
     model: Path | None = None
     """Model file of the network, with the deeplab labeller (train and weights import write them); by default the
     bundled one, for rovers on sand."""

@@ -60,6 +60,7 @@ class RunLog:
         stages_ms: what each stage took for a frame.
         valid_fractions: share of a frame's pixels that have a disparity.
         points_fused: points that the labeller kept.
+        without_ground: frames in which the labeller found no ground below the camera; None where it looks for none.
         total_s: time spent on frames.
         compile_s: time spent on compiling.
         temporary_bytes: memory that the step takes beside the map.
@@ -75,6 +76,7 @@ class RunLog:
     stages_ms: dict[str, Sample] = field(default_factory=dict)
     valid_fractions: Sample = field(default_factory=Sample)
     points_fused: int = 0
+    without_ground: int | None = None
     total_s: float = 0.0
     compile_s: float = 0.0
     temporary_bytes: int = 0
@@ -94,6 +96,9 @@ class RunLog:
         pixels = prepared.rectified.disparity_px.size if prepared.rectified is not None else 1
         self.valid_fractions.add(round(int(fused.info.points_valid) / pixels, 4))
         self.points_fused += int(fused.info.points_kept)
+        # Of the plane labeller as of those that see relief.
+        if (found := getattr(fused.info.estimate, "found", None)) is not None:
+            self.without_ground = (self.without_ground or 0) + (not bool(found))
 
     def as_json(self) -> dict[str, Any]:
         """The log as plain values."""

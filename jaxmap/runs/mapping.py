@@ -110,6 +110,11 @@ def run_plan(
     log.complete = True
     details = _profile(step_profile, program, notify) if profile else {}
     metrics = _write_outputs(plan, folder, log, voxel_map, details)
+    if log.without_ground:
+        notify(
+            f"note: no ground below the camera in {log.without_ground} of {log.fused} frames: nothing there is sand or "
+            "rock by its shape; check that the poses are of the left camera in a z-up world"
+        )
     if report:
         write_report(folder.path)
     if not metrics["voxels"]["occupied"]:
@@ -214,6 +219,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "frames": len(sequence.frames),
             "fused": log.fused,
             "skipped": log.skipped,
+            **({} if log.without_ground is None else {"without_ground": log.without_ground}),
             "crs": sequence.crs,
             "site_origin": sequence.site_origin.tolist(),
             "path_length_m": round(float(steps_m.sum()), 3),

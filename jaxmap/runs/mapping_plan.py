@@ -200,7 +200,7 @@ def choose_labeller(config: MapConfig, label_folder: LabelFolder | None, network
     if config.relief.combine and config.labeller not in ("deeplab", "files"):
         raise UsageError(
             f"--relief is given, but the labeller is {config.labeller}",
-            fix="add --labeller deeplab or files, or take --labeller relief",
+            fix="take --labeller deeplab or files, or leave --relief out",
         )
     if network is not None:
         return _with_relief(make_deeplab_labeller(network, classes, config.deeplab), config)

@@ -12,6 +12,7 @@ from jaxmap.errors import FrameError, UsageError
 from jaxmap.host.settings import NotNegative, Positive, options
 
 _SUBPIXELS = 16
+_FAR_PX = np.float32(1e6)
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 """Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
@@ -35,7 +36,8 @@ class StereoOptions:
     block_size: Annotated[int, Positive] = 7
     """Edge of the matched block, odd."""
     p1: Annotated[int, Positive] | None = None
-    """Penalty for a disparity step of one; by default 16 block_size^2, twice what OpenCV suggests: sand has little texture."""
+    """Penalty for a disparity step of one; by default 16 block_size^2, twice what OpenCV suggests: sand has little
+    texture."""
     p2: Annotated[int, Positive] | None = None
     """Penalty for a greater step; by default 64 block_size^2."""
     pre_filter_cap: Annotated[int, Interval(ge=15, le=63)] = 31
@@ -50,7 +52,7 @@ class StereoOptions:
     speckle_range_px: Annotated[int, NotNegative] = 2
     """Disparity step that ends a blob."""
     edge_step_px: Annotated[float, NotNegative] = 1.5
-    """Pixels near a greater step of disparity are dropped: there, blocks smear rocks over the ground behind them; 0 keeps
+    """Pixels near a greater step of disparity are dropped: there, blocks smear rocks over the ground behind; 0 keeps
     them."""
     edge_window_px: Annotated[int, Positive] = 7
     """Edge of the square, odd, that is near."""
@@ -125,8 +127,8 @@ class Matcher:
             return disparity_px
         square = np.ones((self.options.edge_window_px,) * 2, np.uint8)
         unknown = np.isnan(disparity_px)
-        least = cv2.erode(np.where(unknown, np.float32(np.inf), disparity_px), square)
-        greatest = cv2.dilate(np.where(unknown, np.float32(-np.inf), disparity_px), square)
+        least = cv2.erode(np.where(unknown, _FAR_PX, disparity_px), square)
+        greatest = cv2.dilate(np.where(unknown, -_FAR_PX, disparity_px), square)
         disparity_px[greatest - least > self.options.edge_step_px] = np.nan
         return disparity_px
 

@@ -120,6 +120,8 @@ class OptimiserOptions:
     """Gradients are clipped to this global norm."""
     backbone_rate: Annotated[float, Interval(ge=0, le=10)] = 1.0
     """Factor on the learning rate of the backbone; 0 freezes it."""
+    frozen_units: Annotated[int, Interval(ge=0, le=1000)] = 0
+    """First units of the backbone that are not trained, with its stem; the way back ends there, which saves time."""
     average: Share = 0.0
     """Decay of an exponential moving average of the weights, which is validated and saved in their place; 0: none."""
 

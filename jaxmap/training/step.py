@@ -211,6 +211,9 @@ def is_statistic(name: str) -> bool:
 def trained_names(names: Iterable[str], options: OptimiserOptions) -> frozenset[str]:
     """The names of the weights that the optimiser updates."""
     frozen = ("backbone.",) if options.backbone_rate == 0 else ()
+    if options.frozen_units:
+        # What lies before the first trained weight needs no way back: neither its time nor its memory.
+        frozen = (*frozen, "backbone.stem.", *(f"backbone.units.{unit}." for unit in range(options.frozen_units)))
     return frozenset(name for name in names if not is_statistic(name) and not name.startswith(frozen))
 
 

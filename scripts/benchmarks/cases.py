@@ -86,6 +86,13 @@ def project(size: str) -> Case:
     return case_of(ours.project(scene), pixels, pixels, [beside])
 
 
+def relief(size: str) -> Case:
+    """Height above the local ground, slope and the rest."""
+    scene = make_scene(size)
+    pixels = Amount(scene.pixels, "pixels")
+    return case_of(ours.relief(scene), pixels, pixels, [])
+
+
 def mlesac(size: str) -> Case:
     """A plane in a cloud of as many points as an image has pixels, 40 % of them outliers."""
     points, truth = tilted_cloud(make_scene().pixels)
@@ -282,6 +289,7 @@ GROUPS = {
     "rectify": Group("both images of a pair, by the LocCam's calibration", rectify),
     "match": Group("disparity of a pair, 128 disparities", match),
     "project": Group("disparity to points in the world", project),
+    "relief": Group("the relief of a frame above the local ground", relief),
     "mlesac": Group("the plane in 786,432 points, of which 40 % are outliers", mlesac),
     "carve": Group("free space in the window of one frame, by voxels", carve),
     "integrate": Group("the points of one frame into voxels of 0.2 m, by points", integrate),

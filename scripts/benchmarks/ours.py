@@ -30,9 +30,10 @@ from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import top_down
 from jaxmap.fusion.sensor_model import point_weights
-from jaxmap.geometry import camera as geometry
+from jaxmap.geometry import cloud as geometry
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.geometry.plane import fit_plane_mlesac
+from jaxmap.geometry.relief import relief_of
 from jaxmap.labellers.base import Labeller, label_points, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller
@@ -117,6 +118,12 @@ def points_of(scene: Scene) -> Points:
     cloud = geometry.project(scene.camera, scene.pose, jnp.asarray(scene.disparity_px), DEPTH_RANGE_M, SIGMA_PX)
     classes = jnp.where(cloud.points_world[:, 2] > 0.3, ROVER_CLASSES.index("rock"), ROVER_CLASSES.index("sand"))
     return Points(cloud, PointLabels(cloud.in_range.reshape(-1), labels=classes.astype(jnp.int32)))
+
+
+def relief(scene: Scene) -> Prepared:
+    """The relief of the scene's frame."""
+    up_camera = jnp.asarray(scene.T_world_camera[2, :3], jnp.float32)
+    return prepare(relief_of, scene.camera, up_camera, jnp.asarray(scene.disparity_px))
 
 
 def fit_plane(points: np.ndarray, hypotheses: int) -> Prepared:

@@ -100,6 +100,12 @@ def test_a_switch_can_be_set_to_what_it_is(settings_of):
     assert settings_of("--config", "chiodini2020", "--fusion.no-carve").fusion.carve is False
 
 
+def test_relief_has_a_short_name(settings_of):
+    assert settings_of("--labeller", "deeplab", "--relief").relief.combine is True
+    assert settings_of("--relief.combine", "--relief.weight", "0.5").relief.combine is True
+    assert settings_of("--no-relief").relief.combine is False
+
+
 def test_the_place_of_config_among_the_options_does_not_matter(settings_of, tmp_path):
     (tmp_path / "mine.yaml").write_text("labeller: none\nfusion: {class_hit: 1.25}\n")
     extra = ("--fusion.class-hit", "1.5")

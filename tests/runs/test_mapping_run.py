@@ -16,7 +16,7 @@ from planned_runs import config_of, log_odds, metrics_of, planned, ran, voxels_o
 from scenes import BASELINE_M, BOXES_M, ROCK, SAND, frame_name, pose, scene_frame, timestamp_s, write_folder_sequence
 
 import jaxmap.runs.mapping_plan
-from jaxmap.datasets.poses import read_poses
+from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.geometry.bounds import grid_around_views, map_bytes
@@ -315,3 +315,26 @@ def test_the_front_end_of_a_plan_sees_the_true_depth(scene_folder):
     assert prepared.ref.name == frame_name(0)
     np.testing.assert_allclose(prepared.frame.T_world_camera.as_matrix(), pose(0), atol=1e-6)
     assert prepared.frame.disparity_px.dtype == jnp.float32
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("z_up", [True, False], ids=["z up", "z down"])
+def test_a_run_says_in_how_many_frames_it_found_no_ground(z_up, scene_copy, tmp_path):
+    if not z_up:
+        track = read_poses(scene_copy / "poses.tum")
+        write_tum(scene_copy / "poses.tum", track.timestamps_s, np.diag([1.0, -1.0, -1.0, 1.0]) @ track.T)
+    config, lines = config_of(labeller="relief", stop=2), []
+    plan = plan_run(str(scene_copy), config, lines.append)
+    folder = RunFolder(tmp_path / "run")
+    folder.begin(plan.settings(config), resume=False, overwrite=False)
+    metrics = run_plan(plan, folder, strict=False, checkpoint_every_s=60.0, notify=lines.append)
+    assert metrics["sequence"]["without_ground"] == (0 if z_up else 2)
+    assert any("no ground below the camera in 2 of 2 frames" in line for line in lines) == (not z_up)
+    assert metrics_of(tmp_path / "run")["sequence"]["without_ground"] == metrics["sequence"]["without_ground"]
+
+
+@pytest.mark.slow
+def test_labels_of_files_go_with_relief(scene_folder, tmp_path):
+    labels = {"labeller": "files", "labels": scene_folder / "labels"}
+    with_relief = ran(scene_folder, tmp_path / "run", **labels, relief={"combine": True}, stop=2)
+    assert with_relief["voxels"]["occupied"] and with_relief["sequence"]["without_ground"] == 0

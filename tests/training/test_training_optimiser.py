@@ -103,3 +103,9 @@ def test_long_gradients_are_shortened_together_and_short_ones_left():
     assert np.sqrt(sum((change**2).sum() for change in long.values())) == pytest.approx(0.1 * 2, rel=1e-4)
     np.testing.assert_allclose(updates_of(options, 1e-2)["classifier.bias"], -1e-3, rtol=1e-4)
     np.testing.assert_allclose(updates_of(replace(options, clip_norm=None), 1e4)["classifier.bias"], -1e3, rtol=1e-4)
+
+
+def test_the_first_units_of_a_backbone_may_stay_as_they_are():
+    names = ("backbone.stem.kernel", "backbone.units.0.depthwise.kernel", "backbone.units.10.project.kernel", "aspp.a")
+    assert trained_names(names, OptimiserOptions(frozen_units=1)) == {names[2], names[3]}
+    assert trained_names(names, OptimiserOptions()) == set(names)
