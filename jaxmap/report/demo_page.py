@@ -112,7 +112,8 @@ def _meaning(row: Row) -> str:
     """What the figures of the table mean."""
     share, reach_m = row["rocks"]["found_share"], row["max_range_m"] or row["view_range_m"]
     return (
-        f"<p>Cells of {row['cell_size_m']:g} m within {reach_m:g} m of the camera. A rock is found where the map calls "
+        "<p>The first two are fused by the paper's rule; DeepLabv3+ is the bundled network in both of its rows. "
+        f"Cells of {row['cell_size_m']:g} m within {reach_m:g} m of the camera. A rock is found where the map calls "
         f"at least {share:.0%} of its area in view rock. Frames/s: the whole pipeline, with stereo matching.</p>"
     )
 
