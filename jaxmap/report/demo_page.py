@@ -67,7 +67,7 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
     frames = list(shown.pictures)
     saw = key_frame_row(shown, frames[len(frames) // 3]) if frames else ""
     bodies = [
-        _head(title, shown, last),
+        _head(title, columns, shown, last.row),
         section("What the rover saw", saw),
         in_3d(shown),
         section(
@@ -80,16 +80,20 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
     return write_page(out / "report.html", title, "".join(bodies), drawn=len(shown.voxels.label) > 0)
 
 
-def _head(title: str, shown: RunContents, last: ScoredRun) -> str:
+def _head(title: str, columns: Mapping[str, str], shown: RunContents, row: Row) -> str:
     lead = (
         f"{int(shown.voxel_map.frames_fused)} stereo frames and the rover's poses become a 3D semantic voxel map: by "
         "the two labellers of Chiodini et al. (2020) under their fusion rule, and by jaxmap's own. Each map is scored "
         "against a labelled orthomosaic."
     )
-    row = last.row
+    # The largest rocks, and all: stones are many, and few of them are found.
+    counts = [key for key in list(columns)[1:] if " of " in str(row[key])]
     stats: list[tuple[str, str | None]] = [
         *((f"{key} of rock", _number(row[key.lower()])) for key in ("IoU", "Precision", "Recall")),
-        ("rocks found", str(row["found"])),
+        *(
+            ("all rocks found" if key == "found" else f"rocks {columns[key]} found", row[key])
+            for key in (counts[-1:] + counts[:1])
+        ),
         ("frames/s", _number(row["frames_per_s"])),
     ]
     return header("jaxmap demo", title, lead, stats)
