@@ -90,10 +90,7 @@ def _head(title: str, columns: Mapping[str, str], shown: RunContents, row: Row) 
     counts = [key for key in list(columns)[1:] if " of " in str(row[key])]
     stats: list[tuple[str, str | None]] = [
         *((f"{key} of rock", _number(row[key.lower()])) for key in ("IoU", "Precision", "Recall")),
-        *(
-            ("all rocks found" if key == "found" else f"rocks {columns[key]} found", row[key])
-            for key in (counts[-1:] + counts[:1])
-        ),
+        *(("rocks found" if key == "found" else f"found {columns[key]}", row[key]) for key in counts[:1] + counts[-1:]),
         ("frames/s", _number(row["frames_per_s"])),
     ]
     return header("jaxmap demo", title, lead, stats)
