@@ -64,9 +64,10 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
     above += _picture(out / "truth.png", "Ground truth", "Orthomosaic, at another time of day, with the true rocks")
     classes = shown.voxel_map.classes
     there = {name: class_colours(classes)[index] for index, name in enumerate(classes) if (top.label == index).any()}
-    saw = key_frame_row(shown, next(iter(shown.pictures))) if shown.pictures else ""
+    frames = list(shown.pictures)
+    saw = key_frame_row(shown, frames[len(frames) // 3]) if frames else ""
     bodies = [
-        _head(title, shown, last),
+        _head(title, columns, shown, last.row),
         section("What the rover saw", saw),
         in_3d(shown),
         section(
@@ -79,16 +80,17 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
     return write_page(out / "report.html", title, "".join(bodies), drawn=len(shown.voxels.label) > 0)
 
 
-def _head(title: str, shown: RunContents, last: ScoredRun) -> str:
+def _head(title: str, columns: Mapping[str, str], shown: RunContents, row: Row) -> str:
     lead = (
         f"{int(shown.voxel_map.frames_fused)} stereo frames and the rover's poses become a 3D semantic voxel map: by "
         "the two labellers of Chiodini et al. (2020) under their fusion rule, and by jaxmap's own. Each map is scored "
         "against a labelled orthomosaic."
     )
-    row = last.row
+    # The largest rocks, and all: stones are many, and few of them are found.
+    counts = [key for key in list(columns)[1:] if " of " in str(row[key])]
     stats: list[tuple[str, str | None]] = [
         *((f"{key} of rock", _number(row[key.lower()])) for key in ("IoU", "Precision", "Recall")),
-        ("rocks found", str(row["found"])),
+        *(("rocks found" if key == "found" else f"found {columns[key]}", row[key]) for key in counts[:1] + counts[-1:]),
         ("frames/s", _number(row["frames_per_s"])),
     ]
     return header("jaxmap demo", title, lead, stats)
@@ -111,7 +113,8 @@ def _meaning(row: Row) -> str:
     """What the figures of the table mean."""
     share, reach_m = row["rocks"]["found_share"], row["max_range_m"] or row["view_range_m"]
     return (
-        f"<p>Cells of {row['cell_size_m']:g} m within {reach_m:g} m of the camera. A rock is found where the map calls "
+        "<p>The first two are fused by the paper's rule; DeepLabv3+ is the bundled network in both of its rows. "
+        f"Cells of {row['cell_size_m']:g} m within {reach_m:g} m of the camera. A rock is found where the map calls "
         f"at least {share:.0%} of its area in view rock. Frames/s: the whole pipeline, with stereo matching.</p>"
     )
 

@@ -18,6 +18,7 @@ from jaxmap.commands.demo import demo_rows, found_rocks
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.poses import read_poses
 from jaxmap.datasets.samples import sample_truth
+from jaxmap.geometry.relief import RELIEF_CHANNELS
 from jaxmap.host.files import bundled
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.models.checkpoint import load_network
@@ -72,16 +73,18 @@ def test_the_table_has_the_rows_of_the_paper_and_ours(demo):
 
 
 @pytest.mark.slow
-def test_relief_beats_the_plane_and_both_together_are_best(demo):
+def test_ours_beat_the_paper_s(demo):
     iou = {row["run"]: row["iou"] for row in json.loads((demo / "table.json").read_text())}
-    assert iou["relief_deeplab"] == max(iou.values()) and iou["relief"] > 1.5 * iou["plane_chiodini2020"]
+    assert iou["relief"] > 1.5 * iou["plane_chiodini2020"]
+    assert iou["relief_deeplab"] == max(iou.values())
 
 
 def test_the_bundled_network_is_small_and_knows_the_rover_s_classes():
     path = bundled("rover.safetensors")
     assert path.stat().st_size < 10 * MIB
     model = load_network(path)
-    assert model.architecture.classes == ROVER_CLASSES and model.architecture.backbone == "mobilenet_v2"
+    assert model.architecture.classes == ROVER_CLASSES and model.architecture.backbone == "efficientnet_lite0"
+    assert model.architecture.relief_channels == RELIEF_CHANNELS
 
 
 def test_the_sample_is_small_and_whole():
