@@ -103,7 +103,7 @@ def make_deeplab_labeller(
             f"there is only a backbone ({saved.architecture.backbone})", where=_WHERE, fix="train a network from it"
         )
     mapped = map_classes(saved.architecture.classes, classes, options.class_map)
-    ground = GroundOptions() if saved.architecture.relief_channels and options.relief else None
+    ground = GroundOptions() if saved.architecture.relief_channels and options.see_relief else None
     network = pure_network(*fold_batch_norm(saved.architecture, jax.tree.map(np.asarray, saved.weights)))
     groups = [
         [index for index, target in enumerate(mapped.targets) if target == wanted]

@@ -103,7 +103,7 @@ class DeeplabOptions:
     """Height and width that the network runs at; those of the images without it."""
     soft: bool = True
     """Fuse the probabilities of all classes, not only the likeliest class."""
-    relief: bool = True
+    see_relief: bool = True
     """Show relief to a network that was trained to see it; without, it labels by the image alone."""
     temperature: Annotated[float, Positive] = 1.0
     """Divides the logits: above 1 the probabilities are softer."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -110,16 +110,22 @@ def run_plan(
     log.complete = True
     details = _profile(step_profile, program, notify) if profile else {}
     metrics = _write_outputs(plan, folder, log, voxel_map, details)
-    if log.without_ground:
-        notify(
-            f"note: no ground below the camera in {log.without_ground} of {log.fused} frames: nothing there is sand or "
-            "rock by its shape; check that the poses are of the left camera in a z-up world"
-        )
     if report:
         write_report(folder.path)
-    if not metrics["voxels"]["occupied"]:
-        notify("note: no voxel is occupied: check the bounds, the range and the poses")
+    for note in _notes(log, metrics):
+        notify(f"note: {note}")
     return metrics
+
+
+def _notes(log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
+    """What the user should look at."""
+    if log.without_ground:
+        yield (
+            f"no ground below the camera in {log.without_ground} of {log.fused} frames: nothing there is sand or rock "
+            "by its shape; check that the poses are of the left camera in a z-up world"
+        )
+    if not metrics["voxels"]["occupied"]:
+        yield "no voxel is occupied: check the bounds, the range and the poses"
 
 
 def _write_outputs(

@@ -1,4 +1,4 @@
-"""What geometry and appearance bring: each source of labels on the same traverses, with the matcher of before and of now.
+"""What geometry and appearance bring: each source of labels on the same traverses, by the matcher of before and now.
 
     python scripts/experiments/relief_ladder.py [TRAVERSE...] [--model F] [--json F]
 
@@ -34,8 +34,8 @@ def sources(traverse: Traverse, model: Path | None) -> dict[str, MapConfig]:
     return {
         "MLESAC plane": traverse.config("plane"),
         "relief": replace(traverse.config("plane"), labeller="relief"),
-        "network, image alone": replace(network, deeplab=DeeplabOptions(relief=False)),
-        "... and --relief": replace(network, deeplab=DeeplabOptions(relief=False), relief=both),
+        "network, image alone": replace(network, deeplab=DeeplabOptions(see_relief=False)),
+        "... and --relief": replace(network, deeplab=DeeplabOptions(see_relief=False), relief=both),
         "network sees relief": network,
         "... and --relief (ours)": replace(network, relief=both),
         "true labels": traverse.config("true"),

@@ -35,7 +35,15 @@ count = jax.jit(kernels.count_points, static_argnames="class_count")
 PARAMS = make_fusion_params(CLASSES)
 SUM = FusionRule("sum")
 CAMERA = dict(fx_px=30, cx_px=15.5, cy_px=11.5, baseline_m=0.2, width_px=32, height_px=24)
-PAPER = make_fusion_params(CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_threshold=0.7)
+PAPER = make_fusion_params(
+    CLASSES,
+    occupancy_hit=0.9,
+    occupancy_miss=0.0,
+    class_hit=0.9,
+    class_miss=-0.9,
+    class_prior=0.5,
+    class_threshold=0.7,
+)
 PAPER_RULE = FusionRule("majority", carve=False, range_weighting=False)
 RULES = [FusionRule("sum"), FusionRule("once"), FusionRule("majority"), FusionRule("mean")]
 

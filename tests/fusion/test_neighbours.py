@@ -58,7 +58,7 @@ def test_a_kernel_of_one_in_the_middle_changes_nothing(column):
 def test_a_column_takes_its_neighbours_evidence_and_nothing_is_seen_that_was_not():
     voxel_map, weights = a_map(), np.full((3, 3, 3), 0.5)
     weights[:, 1, 1] = 1.0
-    plain, kernel = make_fusion_params(CLASSES), make_fusion_params(CLASSES, class_kernel=weights)
+    plain, kernel = (make_fusion_params(CLASSES, class_prior=0.5, class_kernel=one) for one in (None, weights))
     before, after = (top_down(voxel_map, params, FusionRule()) for params in (plain, kernel))
     np.testing.assert_array_equal(before.observed, after.observed)
     np.testing.assert_array_equal(before.height_m, after.height_m)

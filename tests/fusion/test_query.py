@@ -16,7 +16,7 @@ from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labels import IGNORE
 from jaxmap.types import make_grid, make_voxel_map
 
-PAPER = make_fusion_params(CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_threshold=0.7)
+PAPER = make_fusion_params(CLASSES, occupancy_hit=0.9, occupancy_miss=0.0, class_prior=0.5, class_threshold=0.7)
 PAPER_RULE = FusionRule("majority", carve=False, range_weighting=False)
 RULES = [FusionRule(), PAPER_RULE, FusionRule(priority_classes=()), FusionRule(priority_classes=("sand", "rock"))]
 
@@ -124,7 +124,7 @@ def test_the_threshold_decides_and_equal_is_not_enough():
 
 def test_columns_join_their_voxels_as_the_rule_says():
     voxel_map = map_of({(2, 3, 0): [1.0, 0, 2.0, -1.0], (2, 3, 1): [1.0, 0, 0.5, 1.5], (2, 3, 4): [-1.0, 0, 0, 9.0]})
-    params = make_fusion_params(CLASSES)
+    params = make_fusion_params(CLASSES, class_prior=0.5)
     summed = query.top_down(voxel_map, params, FusionRule(column="sum"))
     greatest = query.top_down(voxel_map, params, FusionRule(column="max"))
     # The top voxel is free: what it says of classes does not count.

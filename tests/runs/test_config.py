@@ -58,8 +58,8 @@ def test_there_is_a_config_for_each_reading_of_the_paper(name, reading):
 
 def test_the_preset_for_sand_doubles_the_penalties():
     stereo = load_config("sand").stereo
-    usual = replace(stereo, p1=None, p2=None).penalties()
-    assert stereo.mode == "hh" and stereo.penalties() == tuple(2 * penalty for penalty in usual)
+    area = stereo.block_size**2
+    assert stereo.mode == "hh" and stereo.penalties() == (16 * area, 64 * area)
 
 
 configs = st.builds(
@@ -98,7 +98,7 @@ def test_a_config_comes_back_from_its_tree_and_from_yaml(config):
 
 
 def test_every_setting_has_a_default_and_says_what_it_is():
-    sections = ("grid", "depth", "stereo", "fusion", "plane", "deeplab", "ensemble")
+    sections = ("grid", "depth", "stereo", "fusion", "plane", "relief", "deeplab", "ensemble")
     kinds = (GridOptions, DepthOptions, FusionOptions, PlaneOptions, DeeplabOptions, StereoOptions, EnsembleOptions)
     for kind in (MapConfig, *kinds):
         source = "".join(inspect.getsource(one) for one in kind.__mro__ if is_dataclass(one))

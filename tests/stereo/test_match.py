@@ -14,9 +14,13 @@ from jaxmap.stereo.match import Matcher, StereoOptions
 MODES = ("3way", "sgbm", "hh", "hh4")
 
 
+SMALL = dict(block_size=5, p1=200, p2=800, edge_step_px=0.0)
+"""Blocks and penalties for an image of a few thousand pixels, edges and all."""
+
+
 def matched(index: int = 0, **options: object) -> np.ndarray:
     frame = scene_frame(index)
-    return Matcher(StereoOptions(**options), WIDTH_PX)(frame.left, frame.right)
+    return Matcher(StereoOptions(**SMALL | options), WIDTH_PX)(frame.left, frame.right)
 
 
 def valid(disparity_px: np.ndarray) -> float:
@@ -85,7 +89,7 @@ def test_more_uniqueness_is_asked_fewer_matches_are_left():
 def test_small_blobs_are_speckles():
     frame = scene_frame(5)
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT_PX, WIDTH_PX), dtype=np.uint8)
-    options = dict(uniqueness_ratio=0, left_right_max_diff_px=-1)
+    options = SMALL | dict(uniqueness_ratio=0, left_right_max_diff_px=-1)
     without, with_filter = (
         Matcher(StereoOptions(**options, speckle_window=window), WIDTH_PX)(frame.left, noise) for window in (0, 200)
     )
@@ -95,7 +99,7 @@ def test_small_blobs_are_speckles():
 @pytest.mark.parametrize(("size", "window"), [((300, 400), 150), ((60, 80), 100)])
 def test_speckles_are_by_default_an_800th_of_the_image(size, window):
     pair = np.random.default_rng(0).integers(0, 256, (2, *size), dtype=np.uint8)
-    options = dict(num_disparities=32, uniqueness_ratio=0, left_right_max_diff_px=-1)
+    options = SMALL | dict(num_disparities=32, uniqueness_ratio=0, left_right_max_diff_px=-1)
     by_default, same, smaller = (
         Matcher(StereoOptions(**options, speckle_window=chosen), size[1])(*pair) for chosen in (None, window, 20)
     )
@@ -115,6 +119,19 @@ def test_padding_matches_the_leftmost_columns_too():
     assert np.nanmedian(error_px) < 0.3
     both = np.isfinite(padded) & np.isfinite(plain)
     assert (np.abs(padded - plain)[both] < 0.5).mean() > 0.98
+
+
+def test_pixels_near_a_step_of_disparity_are_dropped_and_no_others():
+    every = matched(5)
+    size, step_px = 5, 2.0
+    left = matched(5, edge_window_px=size, edge_step_px=step_px)
+    padded = np.pad(every, size // 2, constant_values=np.nan)
+    near = np.lib.stride_tricks.sliding_window_view(padded, (size, size)).reshape(*every.shape, -1)
+    known = np.isfinite(near).any(axis=-1)
+    spread_px = np.zeros(every.shape)
+    spread_px[known] = np.nanmax(near[known], axis=-1) - np.nanmin(near[known], axis=-1)
+    np.testing.assert_array_equal(left, np.where(spread_px > step_px, np.nan, every))
+    assert 0.5 < valid(left) / valid(every) < 1
 
 
 def test_the_number_of_disparities_bounds_them():
@@ -161,7 +178,7 @@ def test_the_images_are_left_as_they_are():
         (dict(num_disparities=160, pad_left=False), "160 disparities in images 160 px wide"),
         (dict(num_disparities=144, min_disparity_px=16, pad_left=False), "144 disparities"),
         (dict(p1=500, p2=500), "p1 is 500 and p2 is 500"),
-        (dict(p1=900), "p1 is 900 and p2 is 800"),
+        (dict(p1=4000), "p1 is 4000 and p2 is 3136"),
     ],
 )
 def test_options_that_cannot_be_are_refused_by_name(options, named):
