@@ -108,8 +108,7 @@ def run_plan(
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    details = _profile(step_profile, program, notify) if profile else {}
-    metrics = _write_outputs(plan, folder, log, voxel_map, details)
+    metrics = _write_outputs(plan, folder, log, voxel_map, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
     for note in _notes(log, metrics):
