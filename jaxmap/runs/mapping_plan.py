@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,9 @@ from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import Frame, GridSpec, StereoCamera, make_grid
+
+BUNDLED_WIDTH_PX = 512
+"""Width that the bundled network runs at: at twice that it takes four times as long for a hundredth of IoU."""
 
 DEFAULT_VOXELS_M: tuple[Triple, ...] = ((0.05, 0.05, 0.2), (0.1, 0.1, 0.2), (0.2, 0.2, 0.2))
 """The voxels of a map whose settings name none, the finest that fits."""
@@ -183,13 +186,16 @@ def describe_network(model: ModelFile, network: SavedModel, classes: Sequence[st
     )
 
 
-def choose_labeller(config: MapConfig, label_folder: LabelFolder | None, network: SavedModel | None) -> Labeller:
+def choose_labeller(
+    config: MapConfig, label_folder: LabelFolder | None, network: SavedModel | None, camera: StereoCamera
+) -> Labeller:
     """What labels the points.
 
     Args:
         config: the settings.
         label_folder: of the files labeller.
         network: of the deeplab labeller.
+        camera: whose images it labels.
 
     Raises:
         JaxmapError: classes or numbers that do not serve.
@@ -203,7 +209,10 @@ def choose_labeller(config: MapConfig, label_folder: LabelFolder | None, network
             fix="take --labeller deeplab or files, or leave --relief out",
         )
     if network is not None:
-        return _with_relief(make_deeplab_labeller(network, classes, config.deeplab), config)
+        deeplab, shrink = config.deeplab, BUNDLED_WIDTH_PX / camera.width_px
+        if config.model is None and deeplab.size_px is None and shrink < 1:
+            deeplab = replace(deeplab, size_px=(round(shrink * camera.height_px), BUNDLED_WIDTH_PX))
+        return _with_relief(make_deeplab_labeller(network, classes, deeplab), config)
     classes = ROVER_CLASSES if classes is None else classes
     if label_folder is not None:
         return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config)
@@ -297,7 +306,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
     label_folder = choose_label_folder(config, sequence)
     model, network = choose_model(config)
     with _as_usage_error():
-        labeller = choose_labeller(config, label_folder, network)
+        labeller = choose_labeller(config, label_folder, network, front_end.camera)
         if model is not None and network is not None:
             notify(describe_network(model, network, labeller.classes))
         grid = choose_grid(config, sequence, front_end, depth_range_m[1], len(labeller.classes))
