@@ -100,7 +100,7 @@ class DeeplabOptions:
     class_map: Annotated[dict[str, str], _RENAMING_OPTION] = field(default_factory=dict)
     """Classes of the network under the names of the map's, where they differ; several may become one."""
     size_px: tuple[Size, Size] | None = None
-    """Height and width that the network runs at; by default those of the images, and for the bundled network at most 512
+    """Height and width that the network runs at; by default those of the images, the bundled network at most 512
     columns."""
     soft: bool = True
     """Fuse the probabilities of all classes, not only the likeliest class."""
