@@ -73,7 +73,8 @@ def test_relief_is_that_of_the_twin(seed):
     assert ours.found and twin.found
     np.testing.assert_array_equal(ours.known, twin.known)
     np.testing.assert_array_equal(ours.floating, twin.floating)
-    assert ours.floating.any() and 0.3 < ours.known.mean() < 1
+    # Of the second draw, no patch lies in the sky.
+    assert ours.floating.any() == (seed == 0) and 0.3 < ours.known.mean() < 1
     for name, within in dict(height_m=2e-3, sigma_m=2e-3, roughness_m=1e-3, step_m=1e-4, depth_m=1e-4).items():
         np.testing.assert_allclose(getattr(ours, name), getattr(twin, name), atol=within, err_msg=name)
     # Of a wall the tangent is large, and so is what rounding does to it.

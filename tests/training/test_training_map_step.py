@@ -115,9 +115,9 @@ def test_the_pull_back_is_the_gradient_of_the_loss(trainer, weights):
 
     # A short way down, the loss has fallen by as much as the gradient says.
     length = float(optax.global_norm(pulled.gradient))
-    down = {name: weight - 1e-3 / length * pulled.gradient[name] for name, weight in moved.items()}
+    down = {name: weight - 1e-4 / length * pulled.gradient[name] for name, weight in moved.items()}
     (after, _), _ = plain(down)
-    assert 0.7 < float(loss - after) / (1e-3 * length) < 1.3
+    assert 0.7 < float(loss - after) / (1e-4 * length) < 1.3
 
 
 @pytest.mark.slow
