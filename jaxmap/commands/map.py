@@ -34,7 +34,7 @@ class MapArguments:
     out: Path
     """The run folder to write; not the sequence's own folder."""
     config: str | None = None
-    """YAML file, or the name of a bundled one (chiodini2020, katwijk); options given here go before it."""
+    """YAML file, or the name of a bundled one (chiodini2020, katwijk, sand); options given here go before it."""
     resume: bool = False
     """Resume an interrupted run."""
     overwrite: bool = False

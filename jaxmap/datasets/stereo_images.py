@@ -14,6 +14,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 from jaxtyping import Float32
+from PIL import Image
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
@@ -55,15 +56,10 @@ def write_stereo(folder: Path, name: str, disparity_px: Float32[np.ndarray, "H W
     Raises:
         JaxmapError: a file cannot be written.
     """
-    import cv2
-
     coded = np.nan_to_num(disparity_px * DISPARITY_SCALE, nan=0.0).round().clip(0, 65535).astype(np.uint16)
-    done, content = cv2.imencode(".png", coded)
-    if not done:
-        raise JaxmapError("the disparity cannot be encoded", where=name)
     disparity, level_camera = stereo_paths(folder, name)
     with atomic_path(disparity) as temporary:
-        temporary.write_bytes(content.tobytes())
+        Image.fromarray(coded).save(temporary, format="PNG")
     with atomic_path(level_camera) as temporary:
         temporary.write_text(json.dumps(asdict(camera)) + "\n", encoding="utf8")
 

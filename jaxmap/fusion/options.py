@@ -111,8 +111,8 @@ class FusionOptions(FusionRule):
             choices[name] = tuple(classes[index] for index in indices)
         return FusionRule(**choices)
 
-    def priors(self, classes: Sequence[str]) -> Any:
-        """The prior of each class, or what stands for them."""
+    def priors(self, classes: Sequence[str]) -> float | Sequence[float]:
+        """The prior of each class, or one of all."""
         if self.class_prior is not None:
             return self.class_prior
         rare = self.priority(classes)

@@ -127,7 +127,10 @@ def stored_fusion(fusion: Mapping[str, Any], classes: Sequence[str], where: obje
         JaxmapError: the attribute is not of this form, or holds what this version does not know.
     """
     try:
-        return make_fusion_params(classes, **fusion.get("params", {})), FusionRule(**fusion.get("rule", {}))
+        rule = FusionRule(**fusion.get("rule", {}))
+        # The priors that are left to the classes follow the priority.
+        params = make_fusion_params(classes, priority_classes=rule.priority_classes, **fusion.get("params", {}))
+        return params, rule
     except UsageError as error:
         reason = error.what
     except (TypeError, ValueError, AttributeError) as error:

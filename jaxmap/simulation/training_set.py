@@ -204,6 +204,9 @@ def _match(left: np.ndarray, right: np.ndarray, camera: LevelCamera, view: View)
         p1=round(8 * area),
         p2=round(32 * area),
         num_disparities=max(1, math.ceil(nearest_px / 16)) * 16,
+        # What a matcher leaves in the sky and smears at edges is to be learnt from.
+        speckle_window=100,
+        edge_step_px=0.0,
     )
     return Matcher(options, left.shape[1])(left, right)
 

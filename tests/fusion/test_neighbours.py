@@ -12,8 +12,8 @@ from strategies import CLASSES, rngs
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.neighbours import spread_evidence
-from jaxmap.fusion.options import FusionRule
-from jaxmap.fusion.params import make_fusion_params, stored_fusion
+from jaxmap.fusion.options import FusionOptions, FusionRule
+from jaxmap.fusion.params import fusion_attribute, make_fusion_params, stored_fusion
 from jaxmap.fusion.query import top_down, voxel_labels
 from jaxmap.types import make_grid, make_voxel_map
 
@@ -65,6 +65,17 @@ def test_a_column_takes_its_neighbours_evidence_and_nothing_is_seen_that_was_not
     evidence = np.log(np.asarray(before.probability)) - np.log1p(-np.asarray(before.probability))
     spread = np.where(before.observed, looped(np.where(before.observed, evidence, 0), weights), 0)
     np.testing.assert_allclose(after.probability, 1 / (1 + np.exp(-spread)), atol=1e-5)
+
+
+@pytest.mark.parametrize("priority", [None, (), ("sand",)])
+def test_priors_and_threshold_of_the_priority_classes_survive_being_stored(priority):
+    options = FusionOptions(priority_classes=priority)
+    rule = options.rule(CLASSES)
+    params, again = stored_fusion(fusion_attribute(options, rule), CLASSES, "map.zarr")
+    assert again == rule
+    expected = make_fusion_params(CLASSES, options)
+    np.testing.assert_array_equal(params.class_prior, expected.class_prior)
+    np.testing.assert_array_equal(params.class_threshold, expected.class_threshold)
 
 
 def test_a_kernel_survives_being_stored():

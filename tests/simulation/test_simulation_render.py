@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.poses import read_poses
+from jaxmap.datasets.stereo_images import read_stereo
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.simulation.camera_rig import loccam, scaled, undistorted_pixels
@@ -241,3 +242,22 @@ def test_training_images_come_with_masks_and_lists(tmp_path, cli):
         assert mask.shape == (48, 64) and set(np.unique(mask)) <= {0, 1, 2, 255}
         assert "recipe" in json.loads((tmp_path / "a" / "worlds" / f"{path.stem}.json").read_text())
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
+
+
+@pytest.mark.slow
+def test_training_pairs_come_with_the_disparity_of_their_ground(tmp_path, cli):
+    words = ("simulate", "--training", 1, "--stereo", "--size", 192, 256, "--seed", 2, "--samples", 2)
+    assert cli(*words, "--out", tmp_path).status == 0
+    (name,) = [path.stem for path in (tmp_path / "images").iterdir()]
+    stereo = read_stereo(tmp_path, name)
+    assert stereo is not None
+    disparity_px, camera = stereo
+    known = np.isfinite(disparity_px)
+    assert disparity_px.shape == (192, 256) and known.mean() > 0.3
+    assert np.linalg.norm(camera.up_camera) == pytest.approx(1, abs=1e-4)
+    # The ground is nearer in the lower part of the image, and lies below the camera.
+    upper, lower = (np.nanmedian(part) for part in (disparity_px[64:128], disparity_px[128:]))
+    assert lower > upper
+    depth_m = camera.fx_px * camera.baseline_m / lower
+    ray = np.array([0.0, (160 - camera.cy_px) / camera.fy_px, 1.0])
+    assert -2.5 < depth_m * ray @ np.array(camera.up_camera) < -0.3
