@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Interval
 from jaxtyping import Float32
 from PIL import Image
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from jaxmap.datasets.images import read_deep_image
@@ -24,6 +23,12 @@ from jaxmap.host.files import atomic_path
 from jaxmap.host.settings import Positive
 
 DISPARITY_SCALE = 256
+
+
+def _check_unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if abs(np.linalg.norm(vector) - 1) > 0.01:
+        raise ValueError("must be of length 1")
+    return vector
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
@@ -39,7 +44,7 @@ class LevelCamera:
     cy_px: float
     baseline_m: Annotated[float, Positive]
     doffs_px: float
-    up_camera: tuple[Annotated[float, Interval(ge=-1.001, le=1.001)], float, float]
+    up_camera: Annotated[tuple[float, float, float], AfterValidator(_check_unit)]
 
 
 _CAMERA = TypeAdapter(LevelCamera)

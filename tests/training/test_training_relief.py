@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import jax
@@ -14,7 +15,7 @@ from fixtures import cli, shared_cache  # noqa: F401
 from tiny_training import ARCHITECTURE, network_is_tiny, train_words, write_data_and_config  # noqa: F401
 from training_data import CLASSES
 
-from jaxmap.datasets.stereo_images import LevelCamera, write_stereo
+from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, write_stereo
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.relief import RELIEF_CHANNELS, relief_channels, relief_of
 from jaxmap.models.checkpoint import load_network
@@ -27,6 +28,7 @@ from jaxmap.training.step import Batch, make_trainer
 from jaxmap.types import make_stereo_camera
 
 CAMERA = LevelCamera(40.0, 40.0, 20.0, 10.0, 0.3, 0.0, (0.0, -1.0, 0.0))
+UNLEVEL = json.dumps({**asdict(CAMERA), "up_camera": [0.0, 0.0, 0.0]})
 measured = jax.jit(lambda *frame: relief_channels(relief_of(*frame)))
 NAME, SIZE_PX = "i0", (40, 40)
 
@@ -95,6 +97,13 @@ def test_faults_of_disparities_are_found_before_training(copy):
     (copy / "disparity" / f"{NAME}.png").unlink()
     with pytest.raises(JaxmapError, match="no training image has a disparity"):
         opened(copy)
+
+
+@pytest.mark.parametrize("content", ["{", '{"fx_px": 40}', UNLEVEL], ids=["truncated", "incomplete", "no unit vector"])
+def test_a_camera_that_is_none_is_refused(copy, content):
+    (copy / "cameras" / f"{NAME}.json").write_text(content)
+    with pytest.raises(JaxmapError, match="the camera cannot be read"):
+        read_stereo(copy, NAME)
 
 
 def test_the_network_learns_from_relief_alone():
