@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import scenes
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -25,14 +27,20 @@ class Sent(NamedTuple):
     value: Any
 
 
+@cache
+def _types(ros1: bool) -> Any:
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if TF not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+    return store
+
+
 class Messages:
     """Makes messages of one generation of ROS."""
 
     def __init__(self, kind: Kind) -> None:
         self.kind: Kind = kind
-        self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-        if TF not in self.store.types:
-            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+        self.store = _types(kind == "ros1")
 
     def make(self, name: str, *values: Any) -> Any:
         """A message of a type such as `sensor_msgs/Image`, by its fields in order."""
@@ -128,3 +136,49 @@ class Messages:
                 serialise = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
                 writer.write(connections[topic], time_ns, serialise(value, name))
         return path
+
+
+SIZE_PX = (scenes.WIDTH_PX, scenes.HEIGHT_PX)
+K = [[scenes.F_PX, 0, scenes.CX_PX], [0, scenes.F_PX, scenes.CY_PX], [0, 0, 1]]
+FRAMES = 3
+
+
+def time_ns(index: int) -> int:
+    return round(scenes.timestamp_s(index) * 1e9)
+
+
+def P(side: str) -> np.ndarray:
+    return np.column_stack([K, [-scenes.F_PX * scenes.BASELINE_M if side == "right" else 0.0, 0, 0]])
+
+
+def images(messages: Messages, root: str = "/stereo", frame: str = "cam_optical", shift_ns: int = 0) -> list[Sent]:
+    """Rectified pairs and their CameraInfo; headers say when they were taken, the recording is 20 ms late."""
+    sent = []
+    for index in range(FRAMES):
+        taken_ns, pair = time_ns(index), scenes.scene_frame(index)
+        for side, pixels, late_ns in (("left", pair.left, 0), ("right", pair.right, shift_ns)):
+            info = messages.info(SIZE_PX, K, np.zeros(5), np.eye(3), P(side), time_ns=taken_ns, frame=frame)
+            message = messages.image(taken_ns + late_ns, pixels, "mono8", frame, padding=3)
+            topic = f"{root}/{side}/image_rect"
+            sent += [
+                Sent(f"{root}/{side}/camera_info", taken_ns + 20_000_000, info),
+                Sent(topic, taken_ns + 20_000_000, message),
+            ]
+    return sent
+
+
+def camera_poses(messages: Messages, topic: str = "/pose") -> list[Sent]:
+    return [
+        Sent(topic, time_ns(index), messages.pose_stamped(time_ns(index), scenes.pose(index)))
+        for index in range(FRAMES)
+    ]
+
+
+def bag(tmp_path: Path, kind: Kind, sent: list[Sent]) -> Path:
+    name = "log.bag" if kind == "ros1" else "log"
+    return Messages(kind).write(tmp_path / name, sorted(sent, key=lambda message: message.time_ns))
+
+
+def whole_bag(tmp_path: Path, kind: Kind = "ros1") -> Path:
+    messages = Messages(kind)
+    return bag(tmp_path, kind, images(messages) + camera_poses(messages))
