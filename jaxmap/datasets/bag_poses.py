@@ -12,11 +12,11 @@ from jaxmap.datasets.bag_frames import (
     FrameTree,
     axes_of,
     link_to_optical,
-    make_track,
 )
 from jaxmap.datasets.bag_log import BagLog
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at
+from jaxmap.datasets.stamped_poses import make_track
 from jaxmap.errors import JaxmapError
 
 

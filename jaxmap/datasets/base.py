@@ -61,6 +61,8 @@ class StereoSequence:
         crs: the coordinate reference system of `site_origin`, e.g. "EPSG:32631", or None.
         notes: what the reader reports to the user (frames left out, conventions assumed).
         read_pair: reads the images of one frame.
+        true_disparity: reads the true disparity of a frame's left image in px, NaN where unknown; None where the
+            sequence has no truth, and for a frame without one.
     """
 
     name: str
@@ -73,6 +75,7 @@ class StereoSequence:
     site_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    true_disparity: Callable[[FrameRef], np.ndarray | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,7 @@ def assemble(
     notes: Sequence[str] = (),
     read_pair: Callable[[FrameRef], StereoPair] = read_stereo_pair,
     size_px: tuple[int, int] | None = None,
+    true_disparity: Callable[[FrameRef], np.ndarray | None] | None = None,
 ) -> StereoSequence:
     """Joins frames, poses and calibration into a sequence in a z-up world.
 
@@ -164,6 +168,7 @@ def assemble(
         notes: what the reader reports to the user.
         read_pair: reads the images of one frame.
         size_px: width and height of the images; by default those of the first image file.
+        true_disparity: reads the truth of one frame, where there is any.
 
     Raises:
         JaxmapError: frames out of order, counts that disagree, an image of another size than the
@@ -219,6 +224,7 @@ def assemble(
         site_origin=site_origin,
         crs=options.crs or crs,
         notes=tuple(all_notes),
+        true_disparity=true_disparity,
     )
 
 

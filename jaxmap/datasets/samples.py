@@ -66,6 +66,7 @@ def _open_motorcycle(options: ReadOptions) -> StereoSequence:
         track=read_poses(options.poses) if options.poses else make_pose_track(np.zeros(1), np.eye(4)[None]),
         camera=read_camera_yaml(options.calibration) if options.calibration else camera,
         options=options,
+        true_disparity=lambda frame: motorcycle_disparity(),
     )
 
 

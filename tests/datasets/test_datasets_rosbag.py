@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence, rosbag
 from jaxmap.datasets.bag_files import Bag
-from jaxmap.datasets.bag_frames import T_LINK_OPTICAL, make_track
+from jaxmap.datasets.bag_frames import T_LINK_OPTICAL
 from jaxmap.datasets.bag_images import decode_image
 from jaxmap.datasets.bag_log import read_log
 from jaxmap.datasets.crs import to_utm
 from jaxmap.datasets.options import BagOptions
+from jaxmap.datasets.stamped_poses import make_track
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
