@@ -121,7 +121,7 @@ def _read_camera(calibration: Path) -> StereoCamera:
         sizes.append(image_size([content["width"], content["height"]], "width, height", path))
     if sizes[0] != sizes[1]:
         raise JaxmapError("the cameras differ in resolution", where=calibration, fix="give a --calibration of one size")
-    return camera_of_projections(*matrices, sizes[0], calibration)
+    return camera_of_projections(matrices[0], matrices[1], sizes[0], calibration)
 
 
 def _rows(path: Path, columns: int) -> list[list[float]]:
@@ -158,7 +158,8 @@ def _read_truth(path: Path) -> tuple[PoseTrack, int]:
 
 
 def _pose(time_s: float, position_m: list[float], quaternion_xyzw: list[float]) -> StampedPose:
-    return StampedPose(round(time_s * 1e9), tuple(position_m), tuple(quaternion_xyzw))
+    (x, y, z), (qx, qy, qz, qw) = position_m, quaternion_xyzw
+    return StampedPose(round(time_s * 1e9), (x, y, z), (qx, qy, qz, qw))
 
 
 READER = Reader("madmax", "a MADMAX run with img_rect_left and img_rect_right", recognises, open_madmax)

@@ -14,16 +14,16 @@ from jaxmap.errors import JaxmapError, UsageError
 SAMPLE_PREFIX = "sample:"
 
 READERS: dict[str, Reader] = {
-    reader.name: reader
-    for reader in (
-        kitti.READER,
-        euroc.READER,
-        folder.READER,
-        katwijk.READER,
-        rosbag.READER,
-        madmax.READER,
-        tartanair.READER,
-        middlebury.READER,
+    module.READER.name: module.READER
+    for module in (
+        kitti,
+        euroc,
+        folder,
+        katwijk,
+        rosbag,
+        madmax,
+        tartanair,
+        middlebury,
     )
 }
 

@@ -116,7 +116,7 @@ def _simulators_camera(size_px: tuple[int, int], folder: Path) -> StereoCamera:
 
 
 def _read_poses(path: Path, frames: list[FrameRef]) -> tuple[PoseTrack, int]:
-    """The poses of `tx ty tz qx qy qz qw` lines, one for each number of a frame, in an east, north, up world; how many are bad."""
+    """Poses of `tx ty tz qx qy qz qw` lines, one for each number of a frame, turned z-up; and how many are bad."""
     if not path.is_file():
         raise JaxmapError(
             f"the sequence has no poses: there is no file {path}",

@@ -144,8 +144,8 @@ def _notes(log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
     if scores := metrics.get("disparity"):
         yield (
-            f"against the true disparity: median error {scores['median_error_px']:.2f} px, {scores['bad_2']:.1%} off by "
-            f"more than 2 px, {scores['valid']:.0%} of the pixels matched"
+            f"against the true disparity: median error {scores['median_error_px']:.2f} px, {scores['bad_2']:.1%} off "
+            f"by more than 2 px, {scores['valid']:.0%} of the pixels matched"
         )
     if log.without_ground:
         yield (
