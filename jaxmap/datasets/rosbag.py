@@ -56,6 +56,9 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
     by_gps = poses is not None and bag.topics[poses].type == FIX_TYPE
     imu = attitude_topic(bag.topics, options.bag, path) if by_gps else None
     log = read_log(bag, {*pair, *infos, *(name for name in (poses, gps, imu) if name is not None)})
+    for topic in (*pair, *infos):
+        if topic not in (log.infos if topic in infos else log.shots):
+            raise JaxmapError(f"no message of {topic} can be found", where=path, fix="restore the bag, or reindex it")
 
     shots, more = _pair_shots(log, pair, options.bag.max_pair_gap_s, path)
     notes += more + _notes_on_log(log, infos)
