@@ -15,10 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
 from jaxmap.datasets.images import IMAGE_SUFFIXES, image_size_px, read_image
-from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, stereo_paths
-from jaxmap.errors import JaxmapError
-from jaxmap.models.tensor_files import shortened
-from jaxmap.training.masks import (
+from jaxmap.datasets.masks import (
     UNNAMED,
     MaskLookup,
     absent_classes,
@@ -27,6 +24,9 @@ from jaxmap.training.masks import (
     read_labels,
     unnamed_codes,
 )
+from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, stereo_paths
+from jaxmap.errors import JaxmapError
+from jaxmap.models.tensor_files import shortened
 from jaxmap.training.options import DataOptions
 
 MASK_SUFFIXES = (".png",)

@@ -14,7 +14,7 @@ from PIL import Image
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.labels import IGNORE
 from jaxmap.training.data import check_training_set, digest, open_training_set, read_example, split_names
-from jaxmap.training.masks import UNNAMED, make_mask_lookup, meaning, read_labels
+from jaxmap.datasets.masks import UNNAMED, make_mask_lookup, meaning, read_labels
 from jaxmap.training.options import DataOptions
 
 CLASSES = ("sand", "rock")
