@@ -108,7 +108,7 @@ def read_stereo_pair(
     """Reads the images of one frame, see `images.read_image_pair`.
 
     Raises:
-        FrameError: an image cannot be read, is all of one value, or has another size than asked for or than the other.
+        FrameError: an image cannot be read, or has another size than asked for or than the other one.
     """
     where = f"frame {frame.name} ({frame.right})"
     return StereoPair(*read_image_pair(frame.left, frame.right, where, bits=bits, size_px=size_px))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from jaxmap.datasets.bit_depth import BitDepth, to_8_bits, used_bits
 from jaxmap.datasets.options import Bits
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.pictures import open_picture, oriented, raw_mode, size_of, turn_of
+from jaxmap.models.tensor_files import shortened
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 
@@ -26,7 +28,6 @@ _GREY_MODES = ("L", "LA", "La", "1")
 _DEEP_GREY_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _COLOUR_MODES = ("RGB", "RGBA", "RGBX", "RGBa", "P", "PA", "CMYK", "YCbCr", "HSV", "LAB")
 
-_BLANK_SHARE = 0.999
 _FRAMES_TO_JUDGE = 8
 
 ImageArray = UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]
@@ -93,8 +94,7 @@ def read_image_pair(
         size_px: (width, height) that both must declare before either is decoded.
 
     Raises:
-        FrameError: an image cannot be read, is all of one value, or has another size than asked for or than the
-            other one.
+        FrameError: an image cannot be read, or has another size than asked for or than the other one.
     """
     left, right = (read_pixels(path, size_px=size_px) for path in (left_path, right_path))
     if left.shape[:2] != right.shape[:2]:
@@ -108,36 +108,9 @@ def read_image_pair(
     if deep:
         bits = bits or used_bits(deep).bits
         left, right = to_8_bits(left, bits), to_8_bits(right, bits)
-    for image, path in ((left, left_path), (right, right_path)):
-        refuse_blank(image, path)
     if left.ndim != right.ndim:
         left, right = (np.array(Image.fromarray(image).convert("L")) for image in (left, right))
     return left, right
-
-
-def refuse_blank(image: ImageArray, where: object) -> None:
-    """Refuses an image in which nothing can be matched: all of one value, but for a few hot pixels.
-
-    Raises:
-        FrameError: it is.
-    """
-    channels = np.atleast_3d(image)
-    # A few pixels tell nearly every image apart; all are counted only where those are alike.
-    if not (_is_flat(channels[::8, ::8], 0.9) and _is_flat(channels, _BLANK_SHARE)):
-        return
-    value = int(np.bincount(channels[..., 0].ravel()).argmax())
-    kind = {0: "black", 255: "white"}.get(value, "of one grey level")
-    raise FrameError(
-        f"the image is {kind}, and nothing can be matched in it",
-        where=where,
-        fix="check lens cap, exposure and file, or leave the frame out",
-    )
-
-
-def _is_flat(channels: UInt8[np.ndarray, "H W C"], share: float) -> bool:
-    """Whether at least that share of the pixels of every channel have one value."""
-    flat = channels.reshape(-1, channels.shape[2])
-    return all(np.bincount(values).max() >= share * len(values) for values in flat.T)
 
 
 def sequence_bits(pairs: Sequence[tuple[Path, Path]]) -> BitDepth | None:
@@ -169,7 +142,7 @@ def image_size_px(path: Path, *, as_shown: bool = False) -> tuple[int, int]:
     Raises:
         FrameError: the file is missing or not an image.
     """
-    with open_picture(path) as image:
+    with open_picture(path, max_px=None) as image:
         return size_of(image, as_shown=as_shown)
 
 
@@ -179,8 +152,22 @@ def image_rotation_tag(path: Path) -> int:
     Raises:
         FrameError: the file is missing or not an image.
     """
-    with open_picture(path) as image:
+    with open_picture(path, max_px=None) as image:
         return turn_of(image).tag
+
+
+def rotation_notes(images: Sequence[Path]) -> list[str]:
+    """A note on the photographs whose rotation tag turns them; none where there are none."""
+    turned = []
+    for path in images:
+        with suppress(FrameError):
+            turned += [path.name] if image_rotation_tag(path) != 1 else []
+    if not turned:
+        return []
+    return [
+        f"{len(turned)} of {len(images)} images carry a rotation tag ({shortened(turned, 3)}) and are turned as "
+        "viewers show them; masks and labels lie on the turned pixels"
+    ]
 
 
 def first_image_size_px(left_paths: Iterable[Path], where: object) -> tuple[int, int]:
@@ -262,8 +249,9 @@ def _decoded(image: ImageFile.ImageFile, path: Path) -> np.ndarray:
 
 def has_deep_colours(image: ImageFile.ImageFile) -> bool:
     """Whether Pillow would cut or scale the bits of an image not yet decoded: 16-bit colours or alpha, deep PNM."""
-    if image.tile and image.tile[0][0] == "ppm":
-        return image.tile[0][3][1] > 255
+    decoder, _, _, arguments = image.tile[0] if image.tile else ("", None, 0, None)
+    if decoder == "ppm" and isinstance(arguments, tuple):
+        return arguments[-1] > 255
     return image.mode in ("RGB", "RGBA", "RGBX", "LA") and ";16" in raw_mode(image)
 
 

@@ -179,8 +179,28 @@ def unnamed_codes(lookup: MaskLookup, codes: Iterable[int], where: object) -> Ja
     else:
         last = len(lookup.classes) - 1
         what = f"the values {listed} are no class (0 to {last}, and {IGNORE} for none)"
-        fix = f"give all --classes in order, or say what each value stands for: {lookup.option}remap VALUE CLASS ..."
+        order = "give all --classes in order" if lookup.option == "--data." else "take masks of the network's classes"
+        fix = f"{order}, or say what each value stands for: {lookup.option}remap VALUE CLASS ..."
     return JaxmapError(what, where=where, fix=fix)
+
+
+def unlabelled_notes(lookup: MaskLookup, labels: Iterable[int]) -> list[str]:
+    """A note where masks to score against label hardly anything, as those do that write 255 for a class.
+
+    Args:
+        lookup: what their pixels stand for.
+        labels: all that they hold.
+    """
+    held = set(labels)
+    classes = [name for index, name in enumerate(lookup.classes) if index in held]
+    if lookup.kind != "indices" or IGNORE not in held or len(classes) > 1:
+        return []
+    only = f"only {classes[0]} and {IGNORE} (no label)" if classes else f"nothing but {IGNORE} (no label)"
+    named = [f"{lookup.classes.index(name)} {name}" for name in classes]
+    return [
+        f"the masks hold {only}: if {IGNORE} stands for a class, say so: "
+        f"{lookup.option}remap {' '.join([*named, str(IGNORE)])} CLASS"
+    ]
 
 
 def absent_classes(

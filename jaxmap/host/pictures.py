@@ -42,13 +42,13 @@ _KINDS: dict[bytes, type[ImageFile.ImageFile]] = {
 
 
 @contextmanager
-def open_picture(path: Path, noun: str = "image", *, max_px: int = MAX_PX) -> Iterator[ImageFile.ImageFile]:
+def open_picture(path: Path, noun: str = "image", *, max_px: int | None = MAX_PX) -> Iterator[ImageFile.ImageFile]:
     """Opens a picture of one of `FORMATS`; nothing is decoded before the block asks for it.
 
     Args:
         path: a regular file.
         noun: what errors call it.
-        max_px: a picture that declares more pixels is refused.
+        max_px: a picture that declares more pixels is refused; None where it is not decoded here.
 
     Raises:
         FrameError: no such file, none of these formats, too large, or, from the block, anything that a decoder raised.
@@ -70,7 +70,7 @@ def open_picture(path: Path, noun: str = "image", *, max_px: int = MAX_PX) -> It
         raise FrameError(f"the {noun} cannot be read ({reason})", where=path, fix="replace the file") from fault
 
 
-def _identified(file, path: Path, noun: str, max_px: int) -> ImageFile.ImageFile:
+def _identified(file, path: Path, noun: str, max_px: int | None) -> ImageFile.ImageFile:
     start = file.read(16)
     file.seek(0)
     kind = next((kind for magic, kind in _KINDS.items() if start.startswith(magic)), None)
@@ -79,7 +79,7 @@ def _identified(file, path: Path, noun: str, max_px: int) -> ImageFile.ImageFile
         raise FrameError(f"not {article} {noun} of a known format", where=path, fix=f"give {FORMATS}")
     picture = kind(file)
     width, height = picture.size
-    if width * height > max_px:
+    if max_px is not None and width * height > max_px:
         raise FrameError(
             f"the {noun} is {width}x{height} px, more than the {max_px / 1e6:.0f} million that are read at once",
             where=path,
@@ -120,7 +120,8 @@ def turn_of(picture: ImageFile.ImageFile) -> Turn:
 def size_of(picture: ImageFile.ImageFile, *, as_shown: bool = False) -> tuple[int, int]:
     """The declared (width, height) of a picture not yet decoded: of the stored pixels, or as viewers show it."""
     tag, done = turn_of(picture)
-    return picture.size[::-1] if tag > 4 and as_shown != done else picture.size
+    width, height = picture.size
+    return (height, width) if tag > 4 and as_shown != done else (width, height)
 
 
 def oriented(pixels: np.ndarray, turn: Turn, *, as_shown: bool) -> np.ndarray:

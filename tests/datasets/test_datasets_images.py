@@ -106,18 +106,6 @@ def test_a_pair_of_grey_and_rgb_becomes_grey(tmp_path):
     np.testing.assert_allclose(pair.left, RGB @ [0.299, 0.587, 0.114], atol=1)
 
 
-@pytest.mark.parametrize(("value", "kind"), [(0, "black"), (255, "white"), (90, "of one grey level")])
-def test_an_image_of_one_value_is_refused_by_name(tmp_path, value, kind):
-    blank = np.full((60, 80), value, np.uint8)
-    blank[3, 4] = 200
-    textured = saved(tmp_path / "l.png", RNG.integers(0, 256, (60, 80), np.uint8))
-    for image in (blank, np.stack([blank] * 3, axis=-1)):
-        with pytest.raises(FrameError, match=rf"the image is {kind}, and nothing can be matched in it in .*r\.png"):
-            read_stereo_pair(frame_of(textured, saved(tmp_path / "r.png", image)))
-    dark = RNG.integers(0, 3, (60, 80), np.uint8)
-    read_stereo_pair(frame_of(textured, saved(tmp_path / "r.png", dark)))
-
-
 def test_an_image_of_another_size_than_the_calibration_is_refused_before_it_is_decoded(tmp_path):
     left = saved(tmp_path / "l.png", GREY)
     right = saved(tmp_path / "r.png", np.zeros((600, 900), np.uint8))

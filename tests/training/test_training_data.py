@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from jaxmap.datasets.masks import UNNAMED, make_mask_lookup, meaning, read_labels
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.labels import IGNORE
 from jaxmap.training.data import check_training_set, digest, open_training_set, read_example, split_names
-from jaxmap.datasets.masks import UNNAMED, make_mask_lookup, meaning, read_labels
 from jaxmap.training.options import DataOptions
 
 CLASSES = ("sand", "rock")
