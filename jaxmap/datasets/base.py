@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmap.datasets.bit_depth import BRIGHT_SHARE
 from jaxmap.datasets.calibration import read_mounting
 from jaxmap.datasets.images import (
     ImageArray,
@@ -268,8 +267,8 @@ def _bits(frames: Sequence[FrameRef], options: ReadOptions, notes: list[str]) ->
         return options.image_bits
     if options.image_bits is None:
         notes.append(
-            f"the 16-bit images are taken to use {found.bits} bits, as all but {BRIGHT_SHARE:.1%} of their pixels do "
-            f"({found.brighter:.2g} of all are brighter and become white); --image-bits sets it"
+            f"the 16-bit images are taken to use {found.bits} bits ({100 * found.brighter:.2g} % of their pixels are "
+            "brighter, and become white); --image-bits sets it"
         )
     return options.image_bits or found.bits
 

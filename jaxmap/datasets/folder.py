@@ -62,7 +62,7 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
     left, right = _sides(folder) or SIDES[0]
     images = _images(folder / left)
     pairs = pair_files(images, _images(folder / right))
-    partner, key = (dict(zip(images, values, strict=True)) for values in (pairs.right, pairs.keys))
+    partner, key = dict(zip(images, pairs.right, strict=True)), dict(zip(images, pairs.keys, strict=True))
     calibration = options.calibration or folder / "camera.yaml"
     if not calibration.is_file():
         raise JaxmapError(
