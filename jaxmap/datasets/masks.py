@@ -100,7 +100,7 @@ def find_mask(folder: Path, name: str) -> Path | None:
     plain = folder / f"{name}.png"
     if plain.is_file():
         return plain
-    ends = sorted({end for suffix in MASK_SUFFIXES for end in (suffix, suffix.upper(), suffix.capitalize())})
+    ends = sorted({end for suffix in MASK_SUFFIXES for end in (suffix, suffix.upper(), suffix.title())})
     return next((path for end in ends if (path := folder / f"{name}{end}").is_file()), None)
 
 
