@@ -67,7 +67,9 @@ def open_picture(path: Path, noun: str = "image", *, max_px: int | None = MAX_PX
         raise FrameError(f"the {noun} takes more memory than there is", where=path, fix="give a smaller one") from fault
     except Exception as fault:
         reason = str(fault) or type(fault).__name__
-        raise FrameError(f"the {noun} cannot be read ({reason})", where=path, fix="replace the file") from fault
+        raise FrameError(
+            f"the {noun} cannot be read ({reason})", where=path, fix="replace it by a whole one of 8 or 16 bits"
+        ) from fault
 
 
 def _identified(file, path: Path, noun: str, max_px: int | None) -> ImageFile.ImageFile:
@@ -75,8 +77,7 @@ def _identified(file, path: Path, noun: str, max_px: int | None) -> ImageFile.Im
     file.seek(0)
     kind = next((kind for magic, kind in _KINDS.items() if start.startswith(magic)), None)
     if kind is None or (start.startswith(b"RIFF") and start[8:12] != b"WEBP"):
-        article = "a" if noun[0] not in "aeiou" else "an"
-        raise FrameError(f"not {article} {noun} of a known format", where=path, fix=f"give {FORMATS}")
+        raise FrameError("not an image of a known format", where=path, fix=f"give {FORMATS}")
     picture = kind(file)
     width, height = picture.size
     if max_px is not None and width * height > max_px:

@@ -146,7 +146,7 @@ def test_truncated_files_are_refused(tmp_path, suffix, share):
     path = saved(tmp_path / f"whole{suffix}", RNG.integers(0, 256, (64, 64, 3), np.uint8))
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(FrameError, match=r"the image cannot be read \(.*\) in .*; replace the file"):
+    with pytest.raises(FrameError, match=r"the image cannot be read \(.*\) in .*; replace it by a whole one"):
         read_image(path)
 
 
