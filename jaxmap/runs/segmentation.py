@@ -163,16 +163,14 @@ def check_masks(images: Sequence[Path], masks: Sequence[Path], lookup: MaskLooku
         A note where the masks label hardly anything.
 
     Raises:
-        JaxmapError: a mask that cannot be read, of another size than its image, or with values that stand for nothing.
+        JaxmapError: an image or a mask that cannot be read, a mask of another size than its image, or with values that
+            stand for nothing.
     """
     held: set[int] = set()
     for image, mask in zip(images, masks, strict=True):
         labels = read_labels(mask, lookup)
         held |= set(np.unique(labels).tolist())
-        try:
-            width, height = image_size_px(image, as_shown=True)
-        except FrameError:
-            continue  # told when it is labelled
+        width, height = image_size_px(image, as_shown=True)
         known = labels if lookup.negated is None else np.where(labels == ANY_OTHER, np.uint8(IGNORE), labels)
         check_mask(known, (height, width), len(lookup.classes), mask)
     return unlabelled_notes(lookup, held)
