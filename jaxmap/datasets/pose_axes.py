@@ -15,6 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.options import PosesAre, PosesWorld
 
+Axes = Literal["optical", "body", "frd", "opengl"]
+World = Literal["z_up", "z_down", "y_up", "camera"]
+Quaternion = Literal["xyzw", "wxyz"]
+
 
 def _turn(*columns: tuple[int, int, int]) -> np.ndarray:
     """(4, 4), the rotation whose columns are given."""
@@ -23,7 +27,7 @@ def _turn(*columns: tuple[int, int, int]) -> np.ndarray:
     return T
 
 
-T_CHILD_CAMERA: dict[str, np.ndarray] = {
+T_CHILD_CAMERA: dict[Axes, np.ndarray] = {
     "optical": np.eye(4),
     "body": _turn((0, -1, 0), (0, 0, -1), (1, 0, 0)),
     "frd": _turn((0, 1, 0), (0, 0, 1), (1, 0, 0)),
@@ -31,7 +35,7 @@ T_CHILD_CAMERA: dict[str, np.ndarray] = {
 }
 """The optical frame in a frame of each convention; the columns are right, down and forward."""
 
-T_Z_UP_SOURCE: dict[str, np.ndarray] = {
+T_Z_UP_SOURCE: dict[World, np.ndarray] = {
     "z_up": np.eye(4),
     "z_down": _turn((0, 1, 0), (1, 0, 0), (0, 0, -1)),
     "y_up": _turn((1, 0, 0), (0, 0, 1), (0, -1, 0)),
@@ -48,10 +52,10 @@ UPRIGHT = 0.8
 class PoseReading(NamedTuple):
     """How the numbers of a pose file are read; each field is the value of an option."""
 
-    pose_convention: Literal["optical", "body", "frd", "opengl"] = "optical"
-    poses_world: Literal["z_up", "z_down", "y_up", "camera"] = "z_up"
+    pose_convention: Axes = "optical"
+    poses_world: World = "z_up"
     poses_are: PosesAre = "T_world_camera"
-    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    quaternion: Quaternion = "xyzw"
 
     def camera_poses(self, T_file: Float64[np.ndarray, "N 4 4"]) -> Float64[np.ndarray, "N 4 4"]:
         """T_source_camera of poses as they stand in the file, in the file's own world."""

@@ -59,9 +59,7 @@ def match_features(left: np.ndarray, right: np.ndarray, shrink: int = 1) -> Floa
     best, back = distance2.argmin(axis=1), distance2.argmin(axis=0)
     nearest, second = np.partition(distance2, 1, axis=1)[:, :2].T
     kept = rows[(back[best] == rows) & (nearest < RATIO**2 * second)]
-    pixels = [
-        np.array([point.pt for point in points]) for points in (points_left, points_right)
-    ]
+    pixels = [np.array([point.pt for point in points]) for points in (points_left, points_right)]
     both = np.concatenate([pixels[0][kept], pixels[1][best[kept]]], axis=1)
     return (both + 0.5) * shrink - 0.5
 
@@ -143,9 +141,7 @@ def rotate_right(
     return turned[:, :2] / turned[:, 2:]
 
 
-def alignment_homography(
-    camera: StereoCamera, rotation_rad: Float64[np.ndarray, "3"]
-) -> Float64[np.ndarray, "3 3"]:
+def alignment_homography(camera: StereoCamera, rotation_rad: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     """K R inverse(K) of the right camera: it takes pixels of the right image to where they should lie."""
     K = np.array(
         [
