@@ -219,7 +219,8 @@ def assemble(
     T_source_camera = T_source_child[has_pose]
     if T_child_camera is not None:
         T_source_camera = T_source_camera @ (T_child_camera if T_child_camera.ndim == 2 else T_child_camera[has_pose])
-    if options.poses is None and options.calibration is not None and options.calibration.suffix.lower() != ".mat":
+    mounted = options.poses is None or options.pose_convention in ("body", "frd")
+    if mounted and options.calibration is not None and options.calibration.suffix.lower() != ".mat":
         T_source_camera = T_source_camera @ read_mounting(options.calibration)
     T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
