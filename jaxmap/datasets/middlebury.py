@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble
+from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.options import ReadOptions
-from jaxmap.datasets.poses import make_pose_track, read_poses
+from jaxmap.datasets.poses import make_pose_track
 from jaxmap.datasets.projections import camera_of_projections
 from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
@@ -43,7 +43,7 @@ def open_middlebury(folder: Path, options: ReadOptions) -> StereoSequence:
         dataset="middlebury",
         where=folder,
         frames=[FrameRef("im0", 0.0, folder / "im0.png", folder / "im1.png")],
-        track=read_poses(options.poses) if options.poses else make_pose_track(np.zeros(1), np.eye(4)[None]),
+        track=read_pose_track(options, folder) if options.poses else make_pose_track(np.zeros(1), np.eye(4)[None]),
         camera=read_camera_yaml(options.calibration) if options.calibration else camera,
         options=options,
         notes=[f"disparities reach {disparities} px by calib.txt (--stereo.num-disparities)"] * bool(disparities),

@@ -203,6 +203,19 @@ def test_poses_of_the_body_come_to_the_camera_by_tf(tmp_path, kind):
     assert "tf does not say where the camera is" in " ".join(sequence.notes)
 
 
+def test_conventions_that_are_asked_for_are_those_of_the_messages(tmp_path):
+    messages = Messages("ros1")
+    truth = np.stack([scenes.pose(index) for index in range(FRAMES)])
+    sent = images(messages)
+    for index, T in enumerate(truth @ T_LINK_OPTICAL.T):
+        T[:3, 3] *= 1000
+        sent.append(Sent("/odom", time_ns(index), messages.odometry(time_ns(index), T, "cam_optical")))
+    options = ReadOptions(pose_convention="body", poses_unit="mm")
+    sequence = open_sequence(bag(tmp_path, "ros1", sent), options)
+    np.testing.assert_allclose(sequence.T_world_camera, truth, atol=1e-9)
+    assert "body axes at the camera's place, as asked" in sequence.notes
+
+
 def test_a_camera_that_turns_on_the_body_is_followed(tmp_path):
     messages = Messages("ros1")
     sent = images(messages)
