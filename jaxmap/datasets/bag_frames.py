@@ -16,6 +16,9 @@ from jaxmap.errors import JaxmapError
 T_LINK_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """A camera's optical frame (x right, y down, z forward) in its link frame (x forward, y left, z up), REP 103."""
 
+LEAST_TRAVEL_M = 0.2
+"""What moves less does not tell its axes by its motion."""
+
 _GLOBES = ("earth", "ecef")
 """Frames above a local world, in which z is not up (REP 105)."""
 
@@ -146,7 +149,7 @@ def axes_of(T_world_child: Float64[np.ndarray, "N 4 4"]) -> Literal["optical", "
         return "optical"
     steps = np.diff(T_world_child[:, :3, 3], axis=0)
     along = np.abs(np.einsum("nij,ni->nj", T_world_child[:-1, :3, :3], steps)).sum(axis=0)
-    return "optical" if along[2] > along[0] else "body"
+    return "optical" if along[2] > max(2 * along[0], LEAST_TRAVEL_M) else "body"
 
 
 def link_to_optical(frame: str, R_body_camera: Float64[np.ndarray, "3 3"] | None) -> bool:
