@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.bag_frames import T_LINK_OPTICAL, FrameTree, axes_of, link_to_optical
-from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD
+from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE
 from jaxmap.errors import JaxmapError
 
 MESSAGES = Messages("mcap")
@@ -60,7 +60,7 @@ BODY = CAMERA @ np.linalg.inv(T_LINK_OPTICAL)
 def test_axes_are_told_by_attitude_and_motion():
     assert axes_of(CAMERA) == "optical"
     assert axes_of(BODY) == "body"
-    in_a_camera_world = np.linalg.inv(T_Z_UP_CAMERA_WORLD) @ CAMERA
+    in_a_camera_world = np.linalg.inv(T_Z_UP_SOURCE["camera"]) @ CAMERA
     assert axes_of(in_a_camera_world) == "optical"
     standing = np.repeat(BODY[:1], 4, axis=0)
     standing[:, 2, 3] += [0, 0.01, -0.01, 0]
