@@ -259,9 +259,7 @@ def assemble(
             f"{len(selected) - len(kept)} of {len(selected)} frames have no pose and are left out: "
             f"the frames span {_span(timestamps_s[selected])}, the poses {_span(track.timestamps_s)}"
         )
-    if read_pair is None:
-        bits = _bits(frames, options, all_notes)
-        read_pair = partial(read_stereo_pair, bits=bits, size_px=(camera.width_px, camera.height_px))
+    read_pair = read_pair or _reader_of_files(frames, camera, options, all_notes)
     row_of_frame = np.cumsum(has_pose) - 1
     return StereoSequence(
         name=name,
@@ -305,6 +303,14 @@ def _check_frames(
             where=where,
             fix="give the calibration of these images",
         )
+
+
+def _reader_of_files(
+    frames: Sequence[FrameRef], camera: StereoCamera | StereoRig, options: ReadOptions, notes: list[str]
+) -> Callable[[FrameRef], StereoPair]:
+    """Reads pairs with one depth of bits for all; see `_bits` for the notes."""
+    bits = _bits(frames, options, notes)
+    return partial(read_stereo_pair, bits=bits, size_px=(camera.width_px, camera.height_px))
 
 
 def _bits(frames: Sequence[FrameRef], options: ReadOptions, notes: list[str]) -> Bits | None:

@@ -86,8 +86,8 @@ class RunLog:
     digest: str = ""
     complete: bool = False
 
-    def add(self, fused: FusedFrame) -> None:
-        """Takes note of one frame."""
+    def add(self, fused: FusedFrame, scores: DisparityScores | None = None) -> None:
+        """Takes note of one frame, and of how near the truth its disparity is, where that is known."""
         prepared = fused.prepared
         self.next_index = prepared.index + 1
         if fused.info is None:
@@ -102,10 +102,7 @@ class RunLog:
         # Of the plane labeller as of those that see relief.
         if (found := getattr(fused.info.estimate, "found", None)) is not None:
             self.without_ground = (self.without_ground or 0) + (not bool(found))
-
-    def add_scores(self, scores: DisparityScores) -> None:
-        """Takes note of how near the truth a frame's disparity is."""
-        for name, value in scores._asdict().items():
+        for name, value in (scores._asdict() if scores else {}).items():
             self.disparity.setdefault(name, Sample()).add(value)
 
     def as_json(self) -> dict[str, Any]:

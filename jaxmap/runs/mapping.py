@@ -11,7 +11,7 @@ import numpy as np
 import jaxmap
 from jaxmap.ensemble.layer import named_layers
 from jaxmap.errors import JaxmapError
-from jaxmap.evaluation.geometry_scores import score_disparity
+from jaxmap.evaluation.geometry_scores import DisparityScores, score_disparity
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
@@ -82,9 +82,8 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
-            log.add(fused)
+            log.add(fused, _disparity_scores(plan, fused))
             if fused.info is not None:
-                _score_disparity(plan, log, fused.prepared)
                 step_profile.step_done()
             on_frame(fused)
             if fused.info is not None and fused.prepared.index in plan.key_frames:
@@ -118,26 +117,26 @@ def run_plan(
     return metrics
 
 
-def _score_disparity(plan: Plan, log: RunLog, prepared: PreparedFrame) -> None:
+def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
     """Compares the disparity of a rectified frame with its truth, where that is known.
 
     Raises:
         JaxmapError: the truth cannot be read, or is of another size.
     """
-    read, rectified = plan.sequence.true_disparity, prepared.rectified
+    read, rectified, ref = plan.sequence.true_disparity, fused.prepared.rectified, fused.prepared.ref
     if read is None or rectified is None or plan.front_end.rectifier is not None:
-        return
-    truth_px = read(prepared.ref)
+        return None
+    truth_px = read(ref)
     if truth_px is None:
-        return
+        return None
     if truth_px.shape != rectified.disparity_px.shape:
         size, expected = (f"{shape[1]}x{shape[0]}" for shape in (truth_px.shape, rectified.disparity_px.shape))
         raise JaxmapError(
             f"the true disparity is {size} px, the image {expected} px",
-            where=f"frame {prepared.ref.name}",
+            where=f"frame {ref.name}",
             fix="give the truth of this image, or remove it",
         )
-    log.add_scores(score_disparity(rectified.disparity_px, truth_px))
+    return score_disparity(rectified.disparity_px, truth_px)
 
 
 def _notes(log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
