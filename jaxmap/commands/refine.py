@@ -84,7 +84,7 @@ class RefineArguments:
     stride: int = 1
     """Use every n-th frame."""
     overwrite: bool = False
-    """Replace an earlier refinement in the folder."""
+    """Replace an earlier refinement in the folder; it stays until the new one is whole."""
 
 
 def main(words: Sequence[str]) -> int:
