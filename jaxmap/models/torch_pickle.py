@@ -21,7 +21,11 @@ import numpy as np
 
 MAX_AXES = 16
 
+BFLOAT16 = "bf16"
+"""NumPy has no such type: the upper half of a float32."""
+
 _STORAGES = {
+    "BFloat16Storage": BFLOAT16,
     "DoubleStorage": "f8",
     "FloatStorage": "f4",
     "HalfStorage": "f2",
@@ -56,9 +60,14 @@ class Storage:
     count: int
 
     @property
+    def item_bytes(self) -> int:
+        """The size of a number in the file."""
+        return 2 if self.dtype == BFLOAT16 else np.dtype(self.dtype).itemsize
+
+    @property
     def bytes(self) -> int:
         """The size that the file declares."""
-        return self.count * np.dtype(self.dtype).itemsize
+        return self.count * self.item_bytes
 
 
 class Refused(Exception):
@@ -87,7 +96,7 @@ class StoredTensor:
         last = self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.strides, strict=True))
         if count and (last >= self.storage.count or count > self.storage.count):
             raise Refused(f"a tensor of shape {short(list(self.shape))} in a storage of fewer numbers")
-        return count * np.dtype(self.storage.dtype).itemsize
+        return count * self.storage.item_bytes
 
 
 def short(value: object) -> str:
