@@ -10,7 +10,7 @@ import pydantic.dataclasses
 from annotated_types import Ge, Gt, Interval
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from jaxmap.errors import UsageError
+from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.files import config_folder
 
 Config = TypeVar("Config")
@@ -73,7 +73,7 @@ class Settings(Generic[Config]):
         Raises:
             UsageError: no such file, not YAML, an unknown key, or a value out of range.
         """
-        import yaml
+        from jaxmap.host.bounded_text import read_yaml
 
         path = Path(name_or_path)
         if not path.exists():
@@ -82,11 +82,9 @@ class Settings(Generic[Config]):
             known = ", ".join(sorted(file.stem for file in self._folder.glob("*.yaml")))
             raise UsageError(f"no config {name_or_path!r}", fix=f"give a YAML file or one of: {known}")
         try:
-            tree = yaml.safe_load(path.read_text(encoding="utf8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise UsageError(f"not YAML: {error}", where=path, fix="correct the file") from error
-        except OSError as error:
-            raise UsageError(f"cannot be read: {error.strerror}", where=path) from error
+            tree = read_yaml(path)
+        except JaxmapError as error:
+            raise UsageError(error.what, where=error.where, fix=error.fix) from error
         if not isinstance(tree or {}, dict):
             raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
         return self.check({key: value for key, value in (tree or {}).items() if key not in self._given}, where=path)
