@@ -21,7 +21,7 @@ from jaxmap.datasets.images import read_deep_image
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import atomic_path
-from jaxmap.host.settings import Positive
+from jaxmap.host.settings import AnyNumber, Positive
 
 DISPARITY_SCALE = 256
 
@@ -41,10 +41,10 @@ class LevelCamera:
 
     fx_px: Annotated[float, Positive]
     fy_px: Annotated[float, Positive]
-    cx_px: float
-    cy_px: float
+    cx_px: Annotated[float, AnyNumber]
+    cy_px: Annotated[float, AnyNumber]
     baseline_m: Annotated[float, Positive]
-    doffs_px: float
+    doffs_px: Annotated[float, AnyNumber]
     up_camera: Annotated[tuple[float, float, float], AfterValidator(_check_unit)]
 
 
