@@ -22,22 +22,11 @@ from jaxmap.types import make_stereo_camera
 
 def has_bounds(metadata: tuple[Any, ...]) -> bool:
     """Whether both ends are given, and finite."""
-    flat = [
-        part
-        for entry in metadata
-        for part in (entry if isinstance(entry, annotated_types.GroupedMetadata) else [entry])
-    ]
-    lower = [
-        part.ge if isinstance(part, annotated_types.Ge) else part.gt
-        for part in flat
-        if hasattr(part, "ge") or hasattr(part, "gt")
-    ]
-    upper = [
-        part.le if isinstance(part, annotated_types.Le) else part.lt
-        for part in flat
-        if hasattr(part, "le") or hasattr(part, "lt")
-    ]
-    return bool(lower and upper) and all(math.isfinite(number) for number in (*lower, *upper))
+    ends: dict[str, float] = {}
+    for entry in metadata:
+        for part in entry if isinstance(entry, annotated_types.GroupedMetadata) else [entry]:
+            ends |= {end[0]: getattr(part, end) for end in ("ge", "gt", "le", "lt") if hasattr(part, end)}
+    return ends.keys() == {"g", "l"} and all(map(math.isfinite, ends.values()))
 
 
 def unbounded(kind: Any, name: str, metadata: tuple[Any, ...] = ()) -> Iterator[str]:
@@ -57,7 +46,7 @@ def unbounded(kind: Any, name: str, metadata: tuple[Any, ...] = ()) -> Iterator[
             yield from unbounded(inner, name, metadata)
 
 
-def arguments_of(command: str) -> list[type]:
+def arguments_of(command: str) -> list[Any]:
     module = importlib.import_module(f"jaxmap.commands.{command}")
     return [
         kind for name, kind in vars(module).items() if name.endswith("Arguments") and dataclasses.is_dataclass(kind)
@@ -72,8 +61,8 @@ def test_every_number_of_a_command_has_two_bounds(command):
 
 
 def test_a_number_without_a_bound_is_found():
-    hints = {
-        "free": Annotated[float, annotated_types.Ge(0)] | None,
+    hints: dict[str, Any] = {
+        "free": Annotated[float, annotated_types.Ge(0)],
         "bound": Annotated[int, annotated_types.Interval(ge=0, lt=3)],
     }
     assert [list(unbounded(kind, name)) for name, kind in hints.items()] == [["free"], []]
