@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from jaxmap.host.settings import Positive, options
+from jaxmap.host.settings import AnyNumber, Place, Positive, count, options
 
 PosesWorld = Literal["auto", "z_up", "camera"]
 """World of a pose file: z up; x right, y down, z forward; or detected from the cameras' up axes."""
+
+Offset = Annotated[float, AnyNumber]
 
 
 @options("")
@@ -32,15 +34,15 @@ class ReadOptions:
     """Camera file in place of the sequence's own."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
-    antenna_m: tuple[float, float, float] | None = None
+    antenna_m: tuple[Offset, Offset, Offset] | None = None
     """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
     max_pose_gap_s: Annotated[float, Positive] = 1.0
     """Poses farther apart are not bridged."""
-    start: int = 0
+    start: Annotated[int, Place] = 0
     """First frame."""
-    stop: int | None = None
+    stop: Annotated[int, Place] | None = None
     """Frame to stop before, from the end if negative; by default the end."""
-    stride: Annotated[int, Positive] = 1
+    stride: Annotated[int, count(2**31 - 1)] = 1
     """Take every so many frames."""

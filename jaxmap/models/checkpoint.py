@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import parse_json
 from jaxmap.host.files import atomic_path
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, weight_shapes
@@ -198,7 +199,7 @@ def _read_record(metadata: dict[str, str], path: Path) -> tuple[Architecture, Ho
             fix="convert other networks with jaxmap weights import",
         )
     try:
-        record = json.loads(metadata["jaxmap"])
+        record = parse_json(metadata["jaxmap"], f"the metadata of {path}")
         version = record["format_version"]
         if not isinstance(version, int) or version < 1:
             raise ValueError(f"format_version is {version!r}")

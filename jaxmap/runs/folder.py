@@ -22,6 +22,7 @@ from jaxmap.export.voxels import occupied_voxels
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
+from jaxmap.host.bounded_text import read_text
 from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.host.replacement import Replacement
@@ -142,8 +143,8 @@ class RunFolder:
         if holds_map(self.map):
             return True
         try:
-            return self.config.read_text(encoding="utf8").startswith("sequence:")
-        except (OSError, UnicodeDecodeError):
+            return read_text(self.config).startswith("sequence:")
+        except JaxmapError:
             return False
 
     def resume_point(self) -> tuple[VoxelMap, RunLog] | None:

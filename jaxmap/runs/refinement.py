@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -22,6 +21,7 @@ from jaxmap.datasets.poses import write_tum
 from jaxmap.datasets.rasters import read_heights
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.geometry.bounds import usable_depth
+from jaxmap.host.bounded_text import read_json
 from jaxmap.host.output_folder import check_inputs_stay, locked, write_json
 from jaxmap.host.prefetch import prefetch
 from jaxmap.host.replacement import Replacement
@@ -156,8 +156,8 @@ def check_replaceable(out: Path, *, overwrite: bool) -> None:
     if not there:
         return
     try:
-        earlier = json.loads((out / RESULTS).read_text(encoding="utf8"))
-    except (OSError, ValueError, RecursionError):
+        earlier = read_json(out / RESULTS)
+    except JaxmapError:
         earlier = None
     if not isinstance(earlier, dict) or not earlier.keys() >= {"matches", "map_height_spread_m", "whole_map"}:
         raise JaxmapError(

@@ -16,6 +16,7 @@ import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import read_text
 from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, write_json, write_yaml
 from jaxmap.host.replacement import Replacement
@@ -179,8 +180,8 @@ class TrainingFolder:
 
     def _is_of_training(self) -> bool:
         try:
-            return self.config.read_text(encoding="utf8").startswith("training_data:")
-        except (OSError, UnicodeDecodeError):
+            return read_text(self.config).startswith("training_data:")
+        except JaxmapError:
             return False
 
     def write_history(self, log: TrainingLog) -> None:
