@@ -73,12 +73,12 @@ def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
         JaxmapError: the file cannot be read.
         UsageError: settings differ; all of them are named.
     """
-    import yaml
+    from jaxmap.host.bounded_text import read_yaml
 
     try:
-        before = yaml.safe_load(path.read_text(encoding="utf8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise JaxmapError(f"cannot be read: {error}", where=path, fix="start anew with --overwrite") from error
+        before = read_yaml(path)
+    except JaxmapError as error:
+        raise JaxmapError(error.what, where=error.where, fix="start anew with --overwrite") from error
     before = before if isinstance(before, dict) else {}
     before, tree = _dotted(before), _dotted(tree)
     differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))

@@ -14,7 +14,7 @@ import numpy as np
 import jaxmap
 from jaxmap.errors import UsageError
 from jaxmap.fusion.params import fusion_numbers
-from jaxmap.host.files import atomic_path, remove
+from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import write_json, write_yaml
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.report.tuning_page import tuning_page
@@ -341,9 +341,6 @@ class TuningRun:
         return TunedParams(replace(free.fusion, **fusion), labeller)
 
     def _write_config(self, params: TunedParams) -> None:
-        # Scores and page of an earlier run are of other numbers; those of this one come at its end.
-        for suffix in (".json", ".html"):
-            remove(self._out.with_suffix(suffix))
         write_yaml(self._out, mapping_tree(tuned_config(self._config, params)))
 
     def _part(self, cells: list[ScoredCells], held_out: bool) -> ScoredCells:
