@@ -18,7 +18,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import read_text
-from jaxmap.host.files import atomic_path
+from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_same_settings, write_json, write_yaml
 from jaxmap.models.checkpoint import save_model
 from jaxmap.models.deeplab import Weights
@@ -127,7 +127,7 @@ class TrainingFolder:
         """
         tree = {
             "training_data": plan.data.source,
-            "init": None if plan.init is None else str(plan.init.resolve()),
+            "init": None if plan.init is None else str(real_path(plan.init)),
             **TRAIN_SETTINGS.tree(plan.config),
         }
         outputs = (self.model, self.history, self.metrics, self.report, self.config)
@@ -145,7 +145,7 @@ class TrainingFolder:
             fix += "replace it (--overwrite), or choose another folder"
             raise JaxmapError(what, where=self.path, fix=fix)
         for path in outputs:
-            if plan.init is not None and path.resolve() == plan.init.resolve():
+            if plan.init is not None and real_path(path) == real_path(plan.init):
                 raise JaxmapError("an input would be overwritten", where=path, fix="choose another --out")
             path.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
@@ -165,7 +165,7 @@ class TrainingFolder:
         writer.writeheader()
         writer.writerows(log.history)
         with atomic_path(self.history) as temporary:
-            temporary.write_text(text.getvalue(), encoding="utf8")
+            temporary.write_text(text.getvalue(), encoding="utf8", errors="backslashreplace")
 
     def write_report(
         self, plan: TrainingPlan, log: TrainingLog, examples: Sequence[ValidationExample], status: str
@@ -198,7 +198,7 @@ class TrainingFolder:
             )
         )
         with atomic_path(self.report) as temporary:
-            temporary.write_text(page, encoding="utf8")
+            temporary.write_text(page, encoding="utf8", errors="backslashreplace")
         write_json(self.metrics, log.metrics(plan))
 
 
