@@ -119,9 +119,13 @@ def _check_form(array: zarr.Array, name: str, where: Path) -> None:
             where=where,
             fix="read it on a larger machine, or make the map again",
         )
-    if array.nchunks > _MOST_CHUNKS:
-        fix = "restore the folder from a copy or make the map again"
-        raise JaxmapError(f"{name} is stored in {array.nchunks:,} chunks", where=where, fix=fix)
+    chunks = math.prod(-(-size // max(edge, 1)) for size, edge in zip(array.shape, array.chunks, strict=True))
+    if chunks > _MOST_CHUNKS or min(array.chunks, default=1) < 1:
+        raise JaxmapError(
+            f"{name} is stored in {chunks:,} chunks of {' x '.join(map(str, array.chunks))}",
+            where=where,
+            fix="restore the folder from a copy or make the map again",
+        )
 
 
 FORMAT_VERSION = 1
