@@ -297,6 +297,8 @@ def test_one_rock_alone_and_lists_of_another_system(tmp_path):
         ("1 2 3\n1 b 3\n", "line 2"),
         ("1 nan\n", "not finite"),
         ("1 2 -3\n", "not positive"),
+        ("1 1e30\n", "beyond the earth"),
+        ("1 2 1e-300\n", "not positive"),
         ("east,north\n1,2\n", "the columns are east north"),
         ("1 2\n", "do not lie over the map: they reach from"),
     ],
