@@ -168,7 +168,10 @@ class CahvModel:
 
 
 def make_cahv_model(
-    components: Sequence[Sequence[float] | np.ndarray], kind: int = 1, parameter: float = 1.0, where: object = "camera model"
+    components: Sequence[Sequence[float] | np.ndarray],
+    kind: int = 1,
+    parameter: float = 1.0,
+    where: object = "camera model",
 ) -> CahvModel:
     """Checks and builds a camera model.
 

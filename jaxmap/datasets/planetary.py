@@ -1,0 +1,224 @@
+"""Planetary archives: a folder of stereo images with PDS3, PDS4 or VICAR labels that hold camera models and poses.
+
+Each pair is linearised to one pinhole pair that the whole sequence shares; a mast may turn the eyes between pairs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.pds_groups import is_label, opened_product
+from jaxmap.datasets.pds_labels import ProductLabel
+from jaxmap.datasets.planetary_pairs import (
+    CAMERAS,
+    StereoProduct,
+    linearised,
+    of_one_camera,
+    of_one_site,
+    paired,
+    read_labels,
+)
+from jaxmap.datasets.poses import PoseTrack, make_pose_track
+from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.stereo.linearise import NEAR_M, Maps, remap
+
+T_ENU_SITE = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+"""From a site frame (x north, y east, z down) to x east, y north, z up."""
+
+MAX_RESIDUAL_PX = 2.0
+"""Pairs whose entrance pupils move images by more than this, near against far, are refused."""
+
+_TOLD_RESIDUAL_PX = 0.2
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder holds a file that starts like a PDS3, PDS4 or VICAR label."""
+    try:
+        return any(is_label(file) for file in folder.iterdir())
+    except OSError:
+        return False
+
+
+def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
+    """Opens a folder of images with labels (`NAME.IMG`, `NAME.LBL` + `NAME.IMG`, `NAME.xml` + `NAME.img`, `NAME.VIC`).
+
+    Left and right are told by INSTRUMENT_ID or the product's name, and pair up by the spacecraft clock. Images whose
+    label has no camera model, eyes without partner, and pairs of another size, zoom or site than most are left out
+    and counted. The poses are the labels' own, rover in site: x east, y north, z up; `--poses` replaces them, as
+    T_world_camera of the left camera (not rectified; x right, y down, z along its axis) or, as EuRoC csv, of the rover.
+
+    Raises:
+        JaxmapError: no pair can be used, several cameras, no poses, or models that no linear pair holds.
+    """
+    if options.calibration is not None:
+        raise JaxmapError("the camera models come from the labels", where="--calibration", fix="leave the option out")
+    notes: list[str] = []
+    labels = of_one_camera(read_labels(folder, notes), options.camera, folder)
+    pairs = paired(labels, folder, notes)
+    if options.poses is None:
+        pairs = of_one_site(pairs, notes)
+    products = linearised(pairs, folder, notes)
+    times_s, note = _times_s(products)
+    notes.append(note)
+    order = np.argsort(times_s, kind="stable")
+    products, times_s = [products[index] for index in order], times_s[order]
+    _check_residual(products, folder, notes)
+    frames = [
+        FrameRef(product.left.path.stem, float(time_s), product.left.path, product.right.path)
+        for product, time_s in zip(products, times_s, strict=True)
+    ]
+    camera = products[0].pair.camera
+    track, T_child_camera = _poses(products, times_s, options, folder)
+    sequence = assemble(
+        name=Path(os.path.abspath(folder)).name,
+        dataset="planetary",
+        where=folder,
+        frames=frames,
+        track=track,
+        camera=camera,
+        # The world of a label's poses is known; guessing by the cameras' up axes fails where a mast looks down.
+        options=options if options.poses else replace(options, poses_world="z_up"),
+        T_child_camera=T_child_camera,
+        notes=notes,
+        read_pair=_PairReader(products),
+        size_px=(camera.width_px, camera.height_px),
+    )
+    return sequence if options.poses else replace(sequence, T_world_source=T_ENU_SITE)
+
+
+class _PairReader:
+    """Reads and rectifies the pair of a frame; may be called from several threads."""
+
+    def __init__(self, products: Sequence[StereoProduct]) -> None:
+        self._products = {product.left.path.stem: product for product in products}
+        self._pairs = {product.maps_of: products[product.maps_of].pair for product in products}
+        self._maps = lru_cache(maxsize=4)(self._make_maps)
+        lefts = [product.left for product in products]
+        self._white = _white_level([label for label in lefts if label.depth != "uint8"])
+
+    def _make_maps(self, index: int) -> tuple[Maps, Maps]:
+        pair = self._pairs[index]
+        return pair.maps(pair.left), pair.maps(pair.right)
+
+    def __call__(self, frame: FrameRef) -> StereoPair:
+        product = self._products[frame.name]
+        maps = self._maps(product.maps_of)
+        eyes = (product.left, product.right)
+        return StereoPair(
+            *(remap(_to_8_bits(_read_pixels(eye), self._white), its) for eye, its in zip(eyes, maps, strict=True))
+        )
+
+
+def _read_pixels(label: ProductLabel) -> np.ndarray:
+    """(H, W) or (H, W, 3), of the type they are stored in."""
+    try:
+        with opened_product(label.path) as product:
+            bands = product.read()
+    except JaxmapError as fault:
+        raise FrameError(fault.what, where=fault.where, fix=fault.fix) from fault
+    return bands[0] if len(bands) == 1 else np.ascontiguousarray(np.moveaxis(bands, 0, -1))
+
+
+def _to_8_bits(pixels: np.ndarray, white: float) -> np.ndarray:
+    if pixels.dtype == np.uint8:
+        return pixels
+    return np.clip(np.nan_to_num(pixels.astype(np.float32)) * (255 / white), 0, 255).astype(np.uint8)
+
+
+def _white_level(labels: Sequence[ProductLabel], count: int = 8) -> float:
+    """What becomes 255 in deep images: one number for the sequence, or pixels of a frame would not match the next's.
+
+    It is the 99.9th percentile of several images, so that no hot pixel decides it.
+    """
+    brightest = [1.0]
+    for index in np.unique(np.linspace(0, len(labels) - 1, count).astype(int)) if labels else ():
+        try:
+            pixels = _read_pixels(labels[index])[::2, ::2].astype(np.float32)
+        except FrameError:
+            continue
+        brightest.append(float(np.quantile(np.nan_to_num(pixels), 0.999)))
+    return max(brightest)
+
+
+def _check_residual(products: Sequence[StereoProduct], folder: Path, notes: list[str]) -> None:
+    residual_px = max(products[index].pair.residual_px() for index in {product.maps_of for product in products})
+    what = f"the entrance pupils of these CAHVORE cameras move: {residual_px:.1f} px between {NEAR_M:g} m and far away"
+    if residual_px > MAX_RESIDUAL_PX:
+        raise JaxmapError(
+            f"{what}, of which a linear pair can hold {MAX_RESIDUAL_PX:g}",
+            where=folder,
+            fix="take linearised products (GEOMETRY_PROJECTION_TYPE = LINEARIZED), or a smaller part of the images",
+        )
+    if residual_px > _TOLD_RESIDUAL_PX:
+        notes.append(f"{what}, which the linearised pair does not follow")
+
+
+def _times_s(products: Sequence[StereoProduct]) -> tuple[np.ndarray, str]:
+    utc_s = [product.left.time_s for product in products]
+    known = np.array([time_s for time_s in utc_s if time_s is not None])
+    if len(known) == len(utc_s) and len(np.unique(known)) == len(known):
+        return known, "times of the frames from START_TIME, UTC in s since 1970"
+    return np.array(
+        [product.left.clock_s for product in products]
+    ), "times of the frames from the spacecraft clock, in s"
+
+
+def _poses(
+    products: Sequence[StereoProduct], times_s: np.ndarray, options: ReadOptions, folder: Path
+) -> tuple[PoseTrack, np.ndarray | None]:
+    """The track, and the rectified left camera in its child frame where that is another one."""
+    if options.poses is not None:
+        track = read_pose_track(options, options.poses, allow_body=True)
+        return track, np.stack([_T_child_camera(product, track.child == "body") for product in products])
+    T_site_left = [_T_site_left(product) for product in products]
+    known = [index for index, T in enumerate(T_site_left) if T is not None]
+    if not known:
+        raise JaxmapError(
+            f"the labels have no pose of {products[0].left.model_frame or 'the rover'} in its site",
+            where=folder,
+            fix="give poses with --poses FILE (TUM text, T_world_camera of the left camera)",
+        )
+    T = T_ENU_SITE @ np.stack([T for T in T_site_left if T is not None])
+    return make_pose_track(times_s[known], T, where=folder), None
+
+
+def _T_child_camera(product: StereoProduct, of_rover: bool) -> np.ndarray:
+    if of_rover:
+        return product.pair.T_frame_left
+    T_frame_raw = np.eye(4)
+    T_frame_raw[:3, :3], T_frame_raw[:3, 3] = product.left.model.axes, product.left.model.C
+    return np.linalg.inv(T_frame_raw) @ product.pair.T_frame_left
+
+
+def _T_site_left(product: StereoProduct) -> np.ndarray | None:
+    """The rectified left camera in the site frame, by the frames of the label; None where they do not reach it."""
+    name, T = product.left.model_frame, product.pair.T_frame_left
+    for _ in range(8):
+        if _is_level(name):
+            return T
+        if name not in product.left.frames:
+            return None
+        name, T_parent_frame = product.left.frames[name]
+        T = T_parent_frame @ T
+    return None
+
+
+def _is_level(frame: str) -> bool:
+    return "SITE" in frame or "LOCAL_LEVEL" in frame
+
+
+READER = Reader(
+    "planetary",
+    "a folder of PDS3, PDS4 or VICAR stereo images with camera models in their labels",
+    recognises,
+    open_planetary,
+    tuple(name for name, _ in CAMERAS),
+)

@@ -1,0 +1,203 @@
+"""Which images of a planetary archive make stereo pairs of one linear camera; what is left out is noted."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmap.datasets.pds_groups import LABEL_SUFFIXES, is_label
+from jaxmap.datasets.pds_labels import ProductLabel, read_label
+from jaxmap.errors import JaxmapError
+from jaxmap.stereo.linearise import LinearPair, linearise
+
+_SAME_VIEW_PX = 2.0
+_SAME_MAPS_PX = 0.05
+_SAME_BASELINE = 0.01
+
+CAMERAS = (
+    ("navcam", ("NAV", "N*")),
+    ("front_hazcam", ("FHAZ", "FRONT", "F*")),
+    ("rear_hazcam", ("RHAZ", "REAR", "R*")),
+    ("pancam", ("PANCAM", "PANORAMIC", "P*")),
+    ("mastcam_z", ("MCZ", "ZCAM", "MASTCAM_Z", "MASTCAM-Z", "Z*")),
+    ("mastcam", ("MAST", "M*")),
+    ("other", ("",)),
+)
+"""Names for `ReadOptions.camera`, and what the instrument's name then holds."""
+
+
+class StereoProduct(NamedTuple):
+    """A stereo pair: its labels, its linear form, and the index of the pair whose maps it shares."""
+
+    left: ProductLabel
+    right: ProductLabel
+    pair: LinearPair
+    maps_of: int
+
+
+def read_labels(folder: Path, notes: list[str]) -> list[ProductLabel]:
+    """The labels of a folder's images, one for each name; what cannot be used is noted, once for each reason.
+
+    Raises:
+        JaxmapError: none can be used.
+    """
+    by_stem: dict[str, Path] = {}
+    files = [file for file in sorted(folder.iterdir()) if is_label(file)]
+    for file in sorted(files, key=lambda file: LABEL_SUFFIXES.index(file.suffix.lower())):
+        by_stem.setdefault(file.stem.upper(), file)
+    labels: list[ProductLabel] = []
+    faults: defaultdict[str, list[JaxmapError]] = defaultdict(list)
+    for file in sorted(by_stem.values()):
+        try:
+            label = read_label(file)
+        except JaxmapError as fault:
+            faults[fault.what].append(fault)
+        else:
+            labels += [label] if label else []
+    if not labels:
+        first = next(iter(faults.values()))[0] if faults else None
+        raise JaxmapError(
+            f"none of {len(by_stem)} products can be used" + (f": {first.what}" if first else ": none is an image"),
+            where=first.where if first else folder,
+            fix=first.fix if first else "give a folder of stereo images",
+        )
+    for what, same in faults.items():
+        notes.append(f"{len(same)} of {len(by_stem)} images are left out: {what} (first: {same[0].where})")
+    if any(label.model_is_of_frame for label in labels):
+        notes.append("camera models of the full frame are shifted and scaled to the parts that were read out")
+    return labels
+
+
+def of_one_camera(labels: list[ProductLabel], camera: str | None, folder: Path) -> list[ProductLabel]:
+    """The images of the camera that is asked for, or of the only one with both eyes.
+
+    Raises:
+        JaxmapError: several have both eyes and none is asked for, or there are none of that one.
+    """
+    by_camera: defaultdict[str, list[ProductLabel]] = defaultdict(list)
+    for label in labels:
+        by_camera[_camera_of(label.rig)].append(label)
+    if camera is None and len(by_camera) > 1:
+        both = [name for name, its in by_camera.items() if len({label.eye for label in its}) == 2]
+        if len(both) != 1:
+            found = ", ".join(f"{name} ({len(its)} images)" for name, its in sorted(by_camera.items()))
+            raise JaxmapError(f"images of several cameras: {found}", where=folder, fix="choose one with --camera")
+        camera = both[0]
+    chosen = by_camera.get(camera or next(iter(by_camera)), [])
+    if not chosen:
+        raise JaxmapError(f"no images of {camera}, only of {', '.join(sorted(by_camera))}", where=folder)
+    return chosen
+
+
+def _camera_of(rig: str) -> str:
+    return next(name for name, words in CAMERAS if any(word in rig for word in words))
+
+
+def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[tuple[ProductLabel, ProductLabel]]:
+    """Left and right of one clock reading and instrument; of several products the largest that both eyes have.
+
+    Raises:
+        JaxmapError: there is no pair.
+    """
+    eyes: defaultdict[tuple[str, int], dict[str, list[ProductLabel]]] = defaultdict(lambda: {"left": [], "right": []})
+    for label in labels:
+        eyes[label.rig, int(label.clock_s)][label.eye].append(label)
+    pairs, lone, spare, unequal = [], 0, 0, 0
+    for both in eyes.values():
+        sizes = [{(label.size_px, label.bands) for label in its} for its in both.values()]
+        shared = sizes[0] & sizes[1]
+        if not shared:
+            lone += not (sizes[0] and sizes[1])
+            unequal += bool(sizes[0] and sizes[1])
+            continue
+        form = max(shared, key=lambda form: (form[0][0] * form[0][1], form[1]))
+        # The later name is the newer version of a product.
+        left, right = (
+            max((label for label in its if (label.size_px, label.bands) == form), key=lambda label: label.path.stem)
+            for its in both.values()
+        )
+        pairs.append((left, right))
+        spare += sum(map(len, both.values())) - 2
+    if lone:
+        notes.append(f"{lone} exposures have one eye only and are left out")
+    if unequal:
+        notes.append(f"{unequal} pairs have eyes of different sizes and are left out")
+    if spare:
+        notes.append(f"{spare} further products of the same exposures are left out: smaller ones, older versions")
+    if not pairs:
+        raise JaxmapError(
+            f"no pair among {len(labels)} images: {lone} exposures have one eye only, {unequal} eyes of different "
+            "sizes",
+            where=folder,
+            fix="left and right must have the same SPACECRAFT_CLOCK_START_COUNT, in whole seconds, and one size",
+        )
+    return pairs
+
+
+def of_one_site(
+    pairs: list[tuple[ProductLabel, ProductLabel]], notes: list[str]
+) -> list[tuple[ProductLabel, ProductLabel]]:
+    """The pairs whose poses refer to the site that most refer to: each site has its own origin."""
+    sites = Counter(left.site for left, _ in pairs)
+    if len(sites) < 2:
+        return pairs
+    site, count = sites.most_common(1)[0]
+    others = ", ".join(str(other) for other in sorted(sites, key=str) if other != site)
+    notes.append(f"{len(pairs) - count} of {len(pairs)} pairs are of other sites than {site} ({others}), left out")
+    return [pair for pair in pairs if pair[0].site == site]
+
+
+def linearised(pairs: list[tuple[ProductLabel, ProductLabel]], folder: Path, notes: list[str]) -> list[StereoProduct]:
+    """The pairs linearised, those of the view that most share.
+
+    Raises:
+        JaxmapError: none can be linearised.
+    """
+    views: list[list[tuple[ProductLabel, ProductLabel, LinearPair]]] = []
+    first_fault: JaxmapError | None = None
+    faults = 0
+    for left, right in pairs:
+        try:
+            if left.model_frame != right.model_frame:
+                raise JaxmapError(
+                    f"the eyes' models are in {left.model_frame} and {right.model_frame}", where=left.path
+                )
+            pair = linearise(left.model, right.model, left.size_px, where=left.path)
+        except JaxmapError as fault:
+            first_fault, faults = first_fault or fault, faults + 1
+            continue
+        same = next((view for view in views if _looks_the_same(view[0][2], pair)), None)
+        if same is None:
+            views.append(same := [])
+        same.append((left, right, pair))
+    if not views:
+        assert first_fault is not None
+        raise first_fault
+    most = max(views, key=len)
+    if first_fault is not None:
+        notes.append(f"{faults} of {len(pairs)} pairs are left out: {first_fault.what} (first: {first_fault.where})")
+    others = len(pairs) - faults - len(most)
+    if others:
+        notes.append(
+            f"{others} of {len(pairs)} pairs have another size, zoom, part of the detector or baseline, left out"
+        )
+    view = most[0][2].view
+    products: list[StereoProduct] = []
+    samples: list[tuple[int, np.ndarray]] = []
+    for left, right, own in most:
+        pair = own._replace(view=view)
+        sampled = pair.sampled_maps()
+        near = (index for index, other in samples if np.nanmax(np.abs(other - sampled)) < _SAME_MAPS_PX)
+        maps_of = next(near, len(products))
+        if maps_of == len(products):
+            samples.append((maps_of, sampled))
+        products.append(StereoProduct(left, right, pair, maps_of))
+    return products
+
+
+def _looks_the_same(one: LinearPair, other: LinearPair) -> bool:
+    apart_px = np.abs(np.subtract(one.view, other.view)).max()
+    return bool(apart_px < _SAME_VIEW_PX and abs(one.baseline_m / other.baseline_m - 1) < _SAME_BASELINE)

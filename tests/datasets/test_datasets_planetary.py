@@ -1,0 +1,215 @@
+"""The reader of planetary archives: a scene of known geometry written in each form is read back in its place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import planetary_scenes as scenes
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxmap.datasets import ReadOptions, open_sequence
+from jaxmap.datasets.planetary import T_ENU_SITE
+from jaxmap.errors import JaxmapError
+from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.match import StereoOptions
+
+YAW = Rotation.from_euler("ZYX", [2.0, 0.05, -0.03])
+QUATERNION = tuple(YAW.as_quat()[[3, 0, 1, 2]])
+OFFSET = (12.0, -5.0, 0.3)
+
+T_SITE_ROVER = np.eye(4)
+T_SITE_ROVER[:3, :3], T_SITE_ROVER[:3, 3] = YAW.as_matrix(), OFFSET
+
+BLANK = np.zeros((24, 32), np.uint8)
+
+
+def write_pair(folder: Path, suffix=".IMG", kind="CAHVOR", clock_s=127168010.0, pixels=None, pan=0.0, **more) -> None:
+    """Left and right of one exposure; blank, small images unless `pixels` are given."""
+    for side, model in zip(("left", "right"), scenes.rig(kind, pan), strict=True):
+        groups = scenes.keywords(model, kind, side, clock_s, OFFSET, QUATERNION, more.get("site", 3))
+        for name in more.get("without", ()):
+            groups[name] = {}
+        image = pixels[side] if pixels else np.zeros(scenes.SIZE_PX[::-1], np.uint8)
+        scenes.WRITERS[suffix](folder / f"{side[0].upper()}{clock_s:.0f}{suffix}", image, groups, more.get("image"))
+
+
+def rendered(kind: str, top: int, dtype: str) -> dict[str, np.ndarray]:
+    return {
+        side: scenes.render(model, top, dtype) for side, model in zip(("left", "right"), scenes.rig(kind), strict=True)
+    }
+
+
+def true_points(sequence, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each rectified pixel of a frame: the point it shows in the rover frame, and the depth of it."""
+    camera = sequence.camera
+    T_rover_camera = np.linalg.inv(T_SITE_ROVER) @ np.linalg.inv(T_ENU_SITE) @ sequence.T_world_camera[index]
+    v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(float)
+    ahead = np.stack([(u - float(camera.cx_px)) / float(camera.fx_px), (v - float(camera.cy_px)) / float(camera.fy_px),
+                      np.ones_like(u)], -1)  # fmt: skip
+    directions = ahead @ T_rover_camera[:3, :3].T
+    points = scenes.hits(np.broadcast_to(T_rover_camera[:3, 3], directions.shape), directions)
+    return points, (points - T_rover_camera[:3, 3]) @ T_rover_camera[:3, 2]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "kind", "top", "dtype"),
+    [(".IMG", "CAHVOR", 4095, "uint16"), (".LBL", "CAHV", 255, "uint8"), (".VIC", "CAHVORE", 4095, "uint16"),
+     (".xml", "CAHVORE", 255, "uint8"), (".xml", "CAHVOR", 30000, "uint16")],
+)  # fmt: skip
+def test_a_scene_is_read_back_in_its_place(tmp_path, suffix, kind, top, dtype):
+    write_pair(tmp_path, suffix, kind, pixels=rendered(kind, top, dtype))
+    sequence = open_sequence(tmp_path)
+    assert sequence.dataset == "planetary"
+    assert float(sequence.camera.baseline_m) == pytest.approx(0.3, abs=1e-6)
+    pair = sequence.read_pair(sequence.frames[0])
+    assert pair.left.dtype == np.uint8
+    assert pair.left.max() > 200
+    points, depth_m = true_points(sequence, 0)
+    true_px = float(sequence.camera.fx_px * sequence.camera.baseline_m) / depth_m
+
+    # Rows: the right image, moved by the true disparity, lies on the left one.
+    v, u = np.mgrid[: pair.left.shape[0], : pair.left.shape[1]].astype(np.float32)
+    moved = cv2.remap(pair.right, (u - true_px).astype(np.float32), v, cv2.INTER_LINEAR)
+    for rows, columns in ((slice(100, 164), slice(60, 124)), (slice(160, 224), slice(200, 264))):
+        (du, dv), _ = cv2.phaseCorrelate(pair.left[rows, columns].astype(float), moved[rows, columns].astype(float))
+        assert abs(dv) < 0.3
+        assert abs(du) < 0.3
+
+    disparity_px = StereoFrontEnd(sequence.camera, StereoOptions(num_disparities=96))(
+        pair.left, pair.right
+    ).disparity_px
+    near = np.isfinite(disparity_px) & (depth_m < 6)
+    assert near.mean() > 0.35
+    error_px = (disparity_px - true_px)[near]
+    assert abs(np.median(error_px)) < 0.15
+    assert np.quantile(np.abs(error_px), 0.8) < 0.5
+    assert np.nanmin(points[..., 2]) < -0.4, "the box is in view"
+
+
+def test_poses_are_those_of_the_labels_for_every_pan_of_the_mast(tmp_path):
+    for index, pan in enumerate((0.0, 0.8, -1.9)):
+        write_pair(tmp_path, clock_s=127168010.0 + 30 * index, pan=pan)
+    sequence = open_sequence(tmp_path)
+    assert len(sequence.frames) == 3
+    np.testing.assert_allclose(np.diff([frame.timestamp_s for frame in sequence.frames]), 30)
+    for index, pan in enumerate((0.0, 0.8, -1.9)):
+        left, _ = scenes.rig(pan=pan)
+        T_site_camera = np.linalg.inv(T_ENU_SITE) @ sequence.T_world_camera[index]
+        np.testing.assert_allclose(T_site_camera[:3, 3], (T_SITE_ROVER @ [*left.C, 1])[:3], atol=1e-9)
+        assert T_site_camera[:3, 2] @ YAW.as_matrix() @ left.A > 0.999
+    # One look-up serves them all.
+    assert {product.maps_of for product in sequence.read_pair._products.values()} == {0}
+
+
+def test_poses_of_a_file_are_those_of_the_left_camera_as_it_stands(tmp_path):
+    write_pair(tmp_path)
+    left, _ = scenes.rig()
+    own = open_sequence(tmp_path)
+    T_rover_raw = np.eye(4)
+    T_rover_raw[:3, :3], T_rover_raw[:3, 3] = left.axes, left.C
+    T = T_ENU_SITE @ T_SITE_ROVER @ T_rover_raw
+    poses = tmp_path / "poses.tum"
+    numbers = [own.frames[0].timestamp_s, *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+    poses.write_text(" ".join(map(repr, map(float, numbers))))
+    given = open_sequence(tmp_path, ReadOptions(poses=poses, poses_world="z_up"))
+    np.testing.assert_allclose(given.T_world_camera, own.T_world_camera, atol=1e-6)
+
+
+@pytest.mark.parametrize("of_frame", [True, False])
+@pytest.mark.parametrize("suffix", [".IMG", ".xml"])
+def test_a_part_of_the_frame_sees_what_the_frame_sees(tmp_path, suffix, of_frame):
+    """Rows 41 to 200, columns 61 to 260, with the model of the full frame, and with that of the part."""
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "part").mkdir()
+    write_pair(tmp_path / "whole", suffix)
+    for side, model in zip(("left", "right"), scenes.rig(), strict=True):
+        stored = model if of_frame else model.cropped((60, 40))
+        groups = scenes.keywords(stored, "CAHVOR", side, 127168010.0, OFFSET, QUATERNION)
+        scenes.WRITERS[suffix](
+            tmp_path / "part" / f"{side[0].upper()}127168010{suffix}",
+            np.zeros((160, 200), np.uint8),
+            groups,
+            {"FIRST_LINE": 41, "FIRST_LINE_SAMPLE": 61},
+        )
+    whole, part = open_sequence(tmp_path / "whole"), open_sequence(tmp_path / "part")
+    np.testing.assert_allclose(part.T_world_camera, whole.T_world_camera, atol=1e-9)
+    # Both look-ups lead to the same place: the part's, 60 columns and 40 rows further.
+    pixel = np.array([[100.0, 80.0]])
+    (product,) = part.read_pair._products.values()
+    raw = product.pair.raw_pixels(product.left.model, pixel)
+    (frame,) = whole.read_pair._products.values()
+    _, ray = frame.left.model.rays(raw + np.array([60, 40]))
+    _, same = product.left.model.rays(raw)
+    np.testing.assert_allclose(ray, same, atol=1e-9)
+    assert any("full frame" in note for note in part.notes) == of_frame
+
+
+def refused(folder: Path, options: ReadOptions | None = None) -> str:
+    with pytest.raises(JaxmapError) as caught:
+        open_sequence(folder, options)
+    return str(caught.value)
+
+
+def test_labels_without_a_camera_model_are_counted_or_refused(tmp_path):
+    write_pair(tmp_path, without=("GEOMETRIC_CAMERA_MODEL",))
+    assert "none of 2 products can be used: the label has no camera model" in refused(tmp_path)
+    write_pair(tmp_path, clock_s=127168100.0)
+    (note,) = [note for note in open_sequence(tmp_path).notes if "left out" in note]
+    assert note.startswith("2 of 4 images are left out: the label has no camera model")
+
+
+def test_lone_eyes_other_sizes_and_other_sites_are_left_out(tmp_path):
+    for clock_s in (127168010.0, 127168040.0, 127168070.0):
+        write_pair(tmp_path, clock_s=clock_s)
+    small = dict.fromkeys(("left", "right"), BLANK)
+    write_pair(tmp_path, clock_s=127168100.0, pixels=small)
+    write_pair(tmp_path, clock_s=127168130.0, site=4)
+    (tmp_path / "R127168040.IMG").unlink()
+    sequence = open_sequence(tmp_path)
+    assert [frame.name for frame in sequence.frames] == ["L127168010", "L127168070"]
+    notes = " / ".join(sequence.notes)
+    assert "1 exposures have one eye only" in notes
+    assert "other sites than 3 (4)" in notes
+    assert "another size" in notes
+    (tmp_path / "lone").mkdir()
+    (tmp_path / "L127168010.IMG").rename(tmp_path / "lone" / "L127168010.IMG")
+    assert "no pair among 1 images" in refused(tmp_path / "lone")
+
+
+def test_no_poses_are_refused_with_the_way_out(tmp_path):
+    write_pair(tmp_path, without=("ROVER_COORDINATE_SYSTEM",))
+    assert "no pose of ROVER_FRAME" in refused(tmp_path)
+    assert "--poses FILE" in refused(tmp_path)
+
+
+def test_pupils_that_move_too_far_are_refused_in_pixels(tmp_path):
+    for side, side_m in (("left", -0.15), ("right", 0.15)):
+        model = scenes.eye(side_m, kind="CAHVORE", E=(0.4, 0.1, 0.0))
+        groups = scenes.keywords(model, "CAHVORE", side, 127168010.0)
+        scenes.write_pds3(tmp_path / f"{side}.IMG", np.zeros(scenes.SIZE_PX[::-1], np.uint8), groups)
+    assert "px between 1 m and far away" in refused(tmp_path)
+
+
+def test_damaged_files_are_one_line_each(tmp_path):
+    write_pair(tmp_path)
+    (tmp_path / "junk.IMG").write_bytes(b"PDS_VERSION_ID = PDS3\r\n" + b"\xff" * 4000)
+    (tmp_path / "junk.xml").write_text("<Product_Observational><unclosed>")
+    (tmp_path / "cut.VIC").write_bytes(b"LBLSIZE=4096  FORMAT='BYTE'")
+    (tmp_path / "away.LBL").write_text('PDS_VERSION_ID = PDS3\n^IMAGE = "/vsicurl/http://example.org/a.img"\nEND\n')
+    sequence = open_sequence(tmp_path)
+    assert len(sequence.frames) == 1
+    assert sum("left out" in note for note in sequence.notes) >= 2
+
+
+def test_two_cameras_are_chosen_between(tmp_path):
+    write_pair(tmp_path)
+    for file in sorted(tmp_path.glob("*.IMG")):
+        content = (
+            file.read_bytes().replace(b'"NAVCAM_LEFT"', b'"PANCAM_LEFT"').replace(b"NAVCAM_RIGHT", b"PANCAM_RIGHT")
+        )
+        (tmp_path / f"P{file.name}").write_bytes(content)
+    assert "navcam (2 images), pancam (2 images)" in refused(tmp_path)
+    assert open_sequence(tmp_path, ReadOptions(camera="pancam")).frames[0].name == "PL127168010"
