@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ from jaxmap.datasets.planetary_pairs import (
 )
 from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.stereo.linearise import NEAR_M, Maps, remap
+from jaxmap.stereo.linearise import NEAR_M, PairRectifier, SharedView
 
 T_ENU_SITE = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """From a site frame (x north, y east, z down) to x east, y north, z up."""
@@ -65,12 +64,10 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
     pairs = paired(labels, folder, notes)
     if options.poses is None:
         pairs = of_one_site(pairs, notes)
-    products = linearised(pairs, folder, notes)
+    products, shared = linearised(pairs, notes)
+    _check_residual(shared, folder, notes)
     times_s, note = _times_s(products)
     notes.append(note)
-    order = np.argsort(times_s, kind="stable")
-    products, times_s = [products[index] for index in order], times_s[order]
-    _check_residual(products, folder, notes)
     frames = [
         FrameRef(product.left.path.stem, float(time_s), product.left.path, product.right.path)
         for product, time_s in zip(products, times_s, strict=True)
@@ -88,7 +85,7 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
         options=options if options.poses else replace(options, poses_world="z_up"),
         T_child_camera=T_child_camera,
         notes=notes,
-        read_pair=_PairReader(products),
+        read_pair=_PairReader(products, shared),
         size_px=(camera.width_px, camera.height_px),
     )
     return sequence if options.poses else replace(sequence, T_world_source=T_ENU_SITE)
@@ -97,24 +94,15 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
 class _PairReader:
     """Reads and rectifies the pair of a frame; may be called from several threads."""
 
-    def __init__(self, products: Sequence[StereoProduct]) -> None:
-        self._products = {product.left.path.stem: product for product in products}
-        self._pairs = {product.maps_of: products[product.maps_of].pair for product in products}
-        self._maps = lru_cache(maxsize=4)(self._make_maps)
-        lefts = [product.left for product in products]
-        self._white = _white_level([label for label in lefts if label.depth != "uint8"])
-
-    def _make_maps(self, index: int) -> tuple[Maps, Maps]:
-        pair = self._pairs[index]
-        return pair.maps(pair.left), pair.maps(pair.right)
+    def __init__(self, products: Sequence[StereoProduct], shared: SharedView) -> None:
+        self._rows = {product.left.path.stem: (row, product) for row, product in enumerate(products)}
+        self._rectify = PairRectifier(shared)
+        self._white = _white_level([product.left for product in products if product.left.depth != "uint8"])
 
     def __call__(self, frame: FrameRef) -> StereoPair:
-        product = self._products[frame.name]
-        maps = self._maps(product.maps_of)
-        eyes = (product.left, product.right)
-        return StereoPair(
-            *(remap(_to_8_bits(_read_pixels(eye), self._white), its) for eye, its in zip(eyes, maps, strict=True))
-        )
+        row, product = self._rows[frame.name]
+        left, right = (_to_8_bits(_read_pixels(eye), self._white) for eye in (product.left, product.right))
+        return StereoPair(*self._rectify(row, left, right))
 
 
 def _read_pixels(label: ProductLabel) -> np.ndarray:
@@ -148,8 +136,8 @@ def _white_level(labels: Sequence[ProductLabel], count: int = 8) -> float:
     return max(brightest)
 
 
-def _check_residual(products: Sequence[StereoProduct], folder: Path, notes: list[str]) -> None:
-    residual_px = max(products[index].pair.residual_px() for index in {product.maps_of for product in products})
+def _check_residual(shared: SharedView, folder: Path, notes: list[str]) -> None:
+    residual_px = max(shared.pairs[row].residual_px() for row in set(shared.maps_of))
     what = f"the entrance pupils of these CAHVORE cameras move: {residual_px:.1f} px between {NEAR_M:g} m and far away"
     if residual_px > MAX_RESIDUAL_PX:
         raise JaxmapError(

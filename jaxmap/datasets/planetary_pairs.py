@@ -6,16 +6,10 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from jaxmap.datasets.pds_groups import LABEL_SUFFIXES, is_label
 from jaxmap.datasets.pds_labels import ProductLabel, read_label
 from jaxmap.errors import JaxmapError
-from jaxmap.stereo.linearise import LinearPair, linearise
-
-_SAME_VIEW_PX = 2.0
-_SAME_MAPS_PX = 0.05
-_SAME_BASELINE = 0.01
+from jaxmap.stereo.linearise import LinearPair, SharedView, linearise, share_view
 
 CAMERAS = (
     ("navcam", ("NAV", "N*")),
@@ -30,12 +24,11 @@ CAMERAS = (
 
 
 class StereoProduct(NamedTuple):
-    """A stereo pair: its labels, its linear form, and the index of the pair whose maps it shares."""
+    """A stereo pair: its labels and its linear form."""
 
     left: ProductLabel
     right: ProductLabel
     pair: LinearPair
-    maps_of: int
 
 
 def read_labels(folder: Path, notes: list[str]) -> list[ProductLabel]:
@@ -99,6 +92,8 @@ def _camera_of(rig: str) -> str:
 def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[tuple[ProductLabel, ProductLabel]]:
     """Left and right of one clock reading and instrument; of several products the largest that both eyes have.
 
+    They come in the order of the clock.
+
     Raises:
         JaxmapError: there is no pair.
     """
@@ -134,7 +129,7 @@ def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[t
             where=folder,
             fix="left and right must have the same SPACECRAFT_CLOCK_START_COUNT, in whole seconds, and one size",
         )
-    return pairs
+    return sorted(pairs, key=lambda pair: pair[0].clock_s)
 
 
 def of_one_site(
@@ -150,15 +145,16 @@ def of_one_site(
     return [pair for pair in pairs if pair[0].site == site]
 
 
-def linearised(pairs: list[tuple[ProductLabel, ProductLabel]], folder: Path, notes: list[str]) -> list[StereoProduct]:
+def linearised(
+    pairs: list[tuple[ProductLabel, ProductLabel]], notes: list[str]
+) -> tuple[list[StereoProduct], SharedView]:
     """The pairs linearised, those of the view that most share.
 
     Raises:
         JaxmapError: none can be linearised.
     """
-    views: list[list[tuple[ProductLabel, ProductLabel, LinearPair]]] = []
-    first_fault: JaxmapError | None = None
-    faults = 0
+    products: list[StereoProduct] = []
+    faults: list[JaxmapError] = []
     for left, right in pairs:
         try:
             if left.model_frame != right.model_frame:
@@ -167,37 +163,17 @@ def linearised(pairs: list[tuple[ProductLabel, ProductLabel]], folder: Path, not
                 )
             pair = linearise(left.model, right.model, left.size_px, where=left.path)
         except JaxmapError as fault:
-            first_fault, faults = first_fault or fault, faults + 1
-            continue
-        same = next((view for view in views if _looks_the_same(view[0][2], pair)), None)
-        if same is None:
-            views.append(same := [])
-        same.append((left, right, pair))
-    if not views:
-        assert first_fault is not None
-        raise first_fault
-    most = max(views, key=len)
-    if first_fault is not None:
-        notes.append(f"{faults} of {len(pairs)} pairs are left out: {first_fault.what} (first: {first_fault.where})")
-    others = len(pairs) - faults - len(most)
-    if others:
+            faults.append(fault)
+        else:
+            products.append(StereoProduct(left, right, pair))
+    if not products:
+        raise faults[0]
+    if faults:
+        notes.append(f"{len(faults)} of {len(pairs)} pairs are left out: {faults[0].what} (first: {faults[0].where})")
+    shared = share_view([product.pair for product in products])
+    if others := len(products) - len(shared.kept):
         notes.append(
             f"{others} of {len(pairs)} pairs have another size, zoom, part of the detector or baseline, left out"
         )
-    view = most[0][2].view
-    products: list[StereoProduct] = []
-    samples: list[tuple[int, np.ndarray]] = []
-    for left, right, own in most:
-        pair = own._replace(view=view)
-        sampled = pair.sampled_maps()
-        near = (index for index, other in samples if np.nanmax(np.abs(other - sampled)) < _SAME_MAPS_PX)
-        maps_of = next(near, len(products))
-        if maps_of == len(products):
-            samples.append((maps_of, sampled))
-        products.append(StereoProduct(left, right, pair, maps_of))
-    return products
-
-
-def _looks_the_same(one: LinearPair, other: LinearPair) -> bool:
-    apart_px = np.abs(np.subtract(one.view, other.view)).max()
-    return bool(apart_px < _SAME_VIEW_PX and abs(one.baseline_m / other.baseline_m - 1) < _SAME_BASELINE)
+    kept = [products[index]._replace(pair=pair) for index, pair in zip(shared.kept, shared.pairs, strict=True)]
+    return kept, shared

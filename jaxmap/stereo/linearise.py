@@ -5,6 +5,8 @@ The eyes' models are in one frame (a rover's, say); their lenses may be CAHV, CA
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
@@ -20,6 +22,9 @@ REFERENCE_M = 5.0
 NEAR_M = 1.0
 """The nearest depth for which the error of the linear model is told."""
 
+_SAME_VIEW_PX = 2.0
+_SAME_MAPS_PX = 0.05
+_SAME_BASELINE = 0.003
 _GRID = 9
 _FLATTEST = 0.05
 """Rays are cut off at this cosine from the axis: a plane cannot hold a hemisphere."""
@@ -166,9 +171,65 @@ def linearise(
     return LinearPair(left, right, T_frame_left, baseline_m, view)
 
 
-def remap(image: np.ndarray, maps: Maps) -> np.ndarray:
-    """The rectified image, bilinear; what lies outside the raw one is black."""
+class SharedView(NamedTuple):
+    """Pairs that share one view: their indices among those given, and, for each, the first with the same maps."""
+
+    kept: list[int]
+    pairs: list[LinearPair]
+    maps_of: list[int]
+
+
+def share_view(pairs: Sequence[LinearPair]) -> SharedView:
+    """The pairs of the view (size, zoom, part of the detector, baseline) that most have, with one view for all.
+
+    Args:
+        pairs: each with a view of its own.
+    """
+    groups: list[list[int]] = []
+    for index, pair in enumerate(pairs):
+        same = next((group for group in groups if _looks_the_same(pairs[group[0]], pair)), None)
+        if same is None:
+            groups.append(same := [])
+        same.append(index)
+    kept = max(groups, key=len)
+    shared = [pairs[index]._replace(view=pairs[kept[0]].view) for index in kept]
+    firsts: list[tuple[int, np.ndarray]] = []
+    maps_of: list[int] = []
+    for row, pair in enumerate(shared):
+        sampled = pair.sampled_maps()
+        near = (first for first, other in firsts if np.nanmax(np.abs(other - sampled)) < _SAME_MAPS_PX)
+        maps_of.append(next(near, row))
+        if maps_of[-1] == row:
+            firsts.append((row, sampled))
+    return SharedView(kept, shared, maps_of)
+
+
+class PairRectifier:
+    """Makes rectified images of the pairs of a shared view; may be called from several threads."""
+
+    def __init__(self, shared: SharedView) -> None:
+        """Makes maps when they are first used, and keeps a few."""
+        self._maps_of = shared.maps_of
+        pairs = {row: shared.pairs[row] for row in set(shared.maps_of)}
+
+        def maps(row: int) -> tuple[Maps, Maps]:
+            return pairs[row].maps(pairs[row].left), pairs[row].maps(pairs[row].right)
+
+        self._maps = lru_cache(maxsize=4)(maps)
+
+    def __call__(self, row: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The rectified images of the pair of a row, bilinear; what lies outside the raw ones is black."""
+        left_maps, right_maps = self._maps(self._maps_of[row])
+        return _remap(left, left_maps), _remap(right, right_maps)
+
+
+def _remap(image: np.ndarray, maps: Maps) -> np.ndarray:
     return cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def _looks_the_same(one: LinearPair, other: LinearPair) -> bool:
+    apart_px = np.abs(np.subtract(one.view, other.view)).max()
+    return bool(apart_px < _SAME_VIEW_PX and abs(one.baseline_m / other.baseline_m - 1) < _SAME_BASELINE)
 
 
 def _widest_view(

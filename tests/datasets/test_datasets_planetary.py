@@ -101,7 +101,7 @@ def test_poses_are_those_of_the_labels_for_every_pan_of_the_mast(tmp_path):
         np.testing.assert_allclose(T_site_camera[:3, 3], (T_SITE_ROVER @ [*left.C, 1])[:3], atol=1e-9)
         assert T_site_camera[:3, 2] @ YAW.as_matrix() @ left.A > 0.999
     # One look-up serves them all.
-    assert {product.maps_of for product in sequence.read_pair._products.values()} == {0}
+    assert sequence.read_pair._rectify._maps_of == [0, 0, 0]
 
 
 def test_poses_of_a_file_are_those_of_the_left_camera_as_it_stands(tmp_path):
@@ -138,9 +138,9 @@ def test_a_part_of_the_frame_sees_what_the_frame_sees(tmp_path, suffix, of_frame
     np.testing.assert_allclose(part.T_world_camera, whole.T_world_camera, atol=1e-9)
     # Both look-ups lead to the same place: the part's, 60 columns and 40 rows further.
     pixel = np.array([[100.0, 80.0]])
-    (product,) = part.read_pair._products.values()
+    ((_, product),) = part.read_pair._rows.values()
     raw = product.pair.raw_pixels(product.left.model, pixel)
-    (frame,) = whole.read_pair._products.values()
+    ((_, frame),) = whole.read_pair._rows.values()
     _, ray = frame.left.model.rays(raw + np.array([60, 40]))
     _, same = product.left.model.rays(raw)
     np.testing.assert_allclose(ray, same, atol=1e-9)
