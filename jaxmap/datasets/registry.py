@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmap.datasets import euroc, folder, katwijk, kitti, planetary
+from jaxmap.datasets import asp, euroc, folder, katwijk, kitti, planetary
 from jaxmap.datasets.base import Reader, StereoSequence
 from jaxmap.datasets.crs import check_crs
 from jaxmap.datasets.options import ReadOptions
@@ -14,7 +14,8 @@ from jaxmap.errors import JaxmapError, UsageError
 SAMPLE_PREFIX = "sample:"
 
 READERS: dict[str, Reader] = {
-    reader.name: reader for reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER, planetary.READER)
+    reader.name: reader
+    for reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER, planetary.READER, asp.READER)
 }
 
 

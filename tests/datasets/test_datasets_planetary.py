@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions, open_sequence
+from jaxmap.datasets.pds_labels import read_label
 from jaxmap.datasets.planetary import T_ENU_SITE
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.front_end import StereoFrontEnd
@@ -213,3 +215,26 @@ def test_two_cameras_are_chosen_between(tmp_path):
         (tmp_path / f"P{file.name}").write_bytes(content)
     assert "navcam (2 images), pancam (2 images)" in refused(tmp_path)
     assert open_sequence(tmp_path, ReadOptions(camera="pancam")).frames[0].name == "PL127168010"
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "lines", "samples"),
+    [("1664MR0086340000802438C00_DRCL", 1180, 1323), ("2264ML0121141200805116C00_DRCL", 1193, 1338)],
+)
+def test_real_labels_agree_with_themselves(tmp_path, realdata, name, lines, samples):
+    """The camera looks where the mast's frame points, and down in the rover frame is what its accelerometers felt."""
+    text = (realdata / "pds" / f"{name}_pds3.lbl").read_bytes()
+    (tmp_path / f"{name}.lbl").write_bytes(text)
+    (tmp_path / f"{name}.IMG").write_bytes(bytes(3 * lines * samples))
+    label = read_label(tmp_path / f"{name}.lbl")
+    assert label is not None
+    assert (label.rig, label.eye) == ("MAST_*", "left" if "ML" in name else "right")
+    assert label.size_px == (samples, lines)
+    # The label's model is one of the 1338 px that are stored, not of the detector's 1648.
+    assert not label.model_is_of_frame
+    np.testing.assert_allclose(label.frames["RSM_HEAD_FRAME"][1][:3, 0], label.model.A, atol=0.03)
+    felt = re.search(rb"DEV_VECTOR\s*=\s*\(\s*([-0-9.]+),\s*([-0-9.]+),\s*([-0-9.]+)", text)
+    assert felt
+    down_rover = label.frames["ROVER_NAV_FRAME"][1][2, :3]
+    np.testing.assert_allclose(down_rover, [float(number) for number in felt.groups()], atol=1e-3)
