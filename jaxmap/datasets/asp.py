@@ -21,11 +21,11 @@ from jaxmap.datasets.base import (
 from jaxmap.datasets.images import image_size_px, list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.planetary import T_ENU_SITE
-from jaxmap.datasets.poses import make_pose_track
+from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.geometry.tsai import TsaiCamera
-from jaxmap.stereo.linearise import PairRectifier, linearise, share_view
+from jaxmap.stereo.linearise import EyeModel, PairRectifier, SharedView, linearise, share_view
 
 _LENSES = {
     "NULL": (),
@@ -126,41 +126,51 @@ def open_asp(folder: Path, options: ReadOptions) -> StereoSequence:
             raise FrameError(f"not {size_px[0]}x{size_px[1]} px like the first image", where=frame.left)
         return StereoPair(*rectify(rows[frame.name], raw.left, raw.right))
 
-    T_child_camera = None
-    if options.poses is not None:
-        track = read_pose_track(options, options.poses)
-        T_child_camera = np.stack([np.linalg.inv(_pose(pair.left)) @ pair.T_frame_left for pair in shared.pairs])
-    else:
-        T = np.stack([pair.T_frame_left for pair in shared.pairs])
-        if np.abs(T[:, :3, 3]).max() > _PLANET_M:
-            raise JaxmapError(
-                "the cameras are in planetocentric coordinates",
-                where=folder,
-                fix="give poses in a local frame, z up, with --poses FILE",
-            )
-        if options.poses_world == "auto":
-            # Up is -y of a camera; the world's z points down where cameras would hang upside down.
-            upside_down = -T[:, 2, 1].mean() < -0.3
-            T = T_ENU_SITE @ T if upside_down else T
-            options = replace(options, poses_world="z_up")
-            notes += ["the cameras' world is taken for z down and turned z-up"] * bool(upside_down)
-        track = make_pose_track(np.arange(float(len(T))), T, where=folder)
+    def rectify_labels(frame: FrameRef, labels: np.ndarray) -> np.ndarray:
+        return rectify.labels(rows[frame.name], labels)
+
+    track, T_child_camera = _poses(shared, folder, options, notes)
+    # The world of the cameras' own poses is found out already.
+    world = "z_up" if options.poses is None and options.poses_world == "auto" else options.poses_world
     camera = shared.pairs[0].camera
-    return assemble(
+    sequence = assemble(
         name=Path(os.path.abspath(folder)).name,
         dataset="asp",
         where=folder,
         frames=frames,
         track=track,
         camera=camera,
-        options=replace(options, calibration=None),
+        options=replace(options, calibration=None, poses_world=world),
         T_child_camera=T_child_camera,
         notes=notes,
         read_pair=read_pair,
+        size_px=(camera.width_px, camera.height_px),
     )
+    return replace(sequence, rectify_labels=rectify_labels)
 
 
-def _pose(camera) -> np.ndarray:
+def _poses(
+    shared: SharedView, folder: Path, options: ReadOptions, notes: list[str]
+) -> tuple[PoseTrack, np.ndarray | None]:
+    """The track, and the rectified left camera in its child frame where that is another one."""
+    if options.poses is not None:
+        track = read_pose_track(options, options.poses)
+        return track, np.stack([np.linalg.inv(_pose(pair.left)) @ pair.T_frame_left for pair in shared.pairs])
+    T = np.stack([pair.T_frame_left for pair in shared.pairs])
+    if np.abs(T[:, :3, 3]).max() > _PLANET_M:
+        raise JaxmapError(
+            "the cameras are in planetocentric coordinates",
+            where=folder,
+            fix="give poses in a local frame, z up, with --poses FILE",
+        )
+    # Up is -y of a camera; the world's z points down where cameras would hang upside down.
+    if options.poses_world == "auto" and -T[:, 2, 1].mean() < -0.3:
+        T = T_ENU_SITE @ T
+        notes.append("the cameras' world is taken for z down and turned z-up")
+    return make_pose_track(np.arange(float(len(T))), T, where=folder), None
+
+
+def _pose(camera: EyeModel) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = camera.axes, camera.centre
     return T

@@ -73,6 +73,7 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
         for product, time_s in zip(products, times_s, strict=True)
     ]
     camera = products[0].pair.camera
+    read_pair = _PairReader(products, shared)
     track, T_child_camera = _poses(products, times_s, options, folder)
     sequence = assemble(
         name=Path(os.path.abspath(folder)).name,
@@ -85,9 +86,10 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
         options=options if options.poses else replace(options, poses_world="z_up"),
         T_child_camera=T_child_camera,
         notes=notes,
-        read_pair=_PairReader(products, shared),
+        read_pair=read_pair,
         size_px=(camera.width_px, camera.height_px),
     )
+    sequence = replace(sequence, rectify_labels=read_pair.rectify_labels)
     return sequence if options.poses else replace(sequence, T_world_source=T_ENU_SITE)
 
 
@@ -103,6 +105,10 @@ class _PairReader:
         row, product = self._rows[frame.name]
         left, right = (_to_8_bits(_read_pixels(eye), self._white) for eye in (product.left, product.right))
         return StereoPair(*self._rectify(row, left, right))
+
+    def rectify_labels(self, frame: FrameRef, labels: np.ndarray) -> np.ndarray:
+        """Labels or probabilities of a frame's raw left image, rectified."""
+        return self._rectify.labels(self._rows[frame.name][0], labels)
 
 
 def _read_pixels(label: ProductLabel) -> np.ndarray:

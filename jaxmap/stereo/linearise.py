@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from jaxmap.errors import JaxmapError
+from jaxmap.labels import IGNORE
 from jaxmap.types import StereoCamera, make_stereo_camera
 
 REFERENCE_M = 5.0
@@ -205,7 +206,7 @@ def share_view(pairs: Sequence[LinearPair]) -> SharedView:
 
 
 class PairRectifier:
-    """Makes rectified images of the pairs of a shared view; may be called from several threads."""
+    """Makes rectified images and labels of the pairs of a shared view; may be called from several threads."""
 
     def __init__(self, shared: SharedView) -> None:
         """Makes maps when they are first used, and keeps a few."""
@@ -221,6 +222,20 @@ class PairRectifier:
         """The rectified images of the pair of a row, bilinear; what lies outside the raw ones is black."""
         left_maps, right_maps = self._maps(self._maps_of[row])
         return _remap(left, left_maps), _remap(right, right_maps)
+
+    def labels(self, row: int, labels: np.ndarray) -> np.ndarray:
+        """Label image (H, W) or probabilities (H, W, C) of the raw left image of a row, rectified.
+
+        Labels take the nearest pixel and are `IGNORE` outside; probabilities are interpolated and 0 outside.
+        """
+        maps = self._maps(self._maps_of[row])[0]
+        if labels.ndim == 2:
+            return cv2.remap(
+                labels, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(IGNORE,) * 4
+            )
+        # With a border, OpenCV remaps at most four channels at once.
+        planes = [_remap(np.ascontiguousarray(labels[..., c]), maps) for c in range(labels.shape[2])]
+        return np.stack(planes, axis=-1)
 
 
 def _remap(image: np.ndarray, maps: Maps) -> np.ndarray:

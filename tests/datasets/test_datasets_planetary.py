@@ -120,6 +120,20 @@ def test_poses_of_a_file_are_those_of_the_left_camera_as_it_stands(tmp_path):
     np.testing.assert_allclose(given.T_world_camera, own.T_world_camera, atol=1e-6)
 
 
+def test_labels_of_raw_images_are_rectified_with_them(tmp_path):
+    write_pair(tmp_path)
+    sequence = open_sequence(tmp_path)
+    assert sequence.rectify_labels is not None
+    columns = np.broadcast_to(np.arange(scenes.SIZE_PX[0]), scenes.SIZE_PX[::-1])
+    ((_, product),) = sequence.read_pair._rows.values()
+    raw = product.pair.raw_pixels(product.left.model, np.array([[200.0, 150.0], [33.0, 77.0]]))
+    found = sequence.rectify_labels(sequence.frames[0], (columns // 2).astype(np.uint8))
+    np.testing.assert_allclose(found[[150, 77], [200, 33]], raw[:, 0] / 2, atol=0.75)
+    soft = np.stack([columns / 400] * 5, -1).astype(np.float32)
+    found = sequence.rectify_labels(sequence.frames[0], soft)
+    np.testing.assert_allclose(found[[150, 77], [200, 33]], np.tile(raw[:, :1] / 400, 5), atol=1e-3)
+
+
 @pytest.mark.parametrize("of_frame", [True, False])
 @pytest.mark.parametrize("suffix", [".IMG", ".xml"])
 def test_a_part_of_the_frame_sees_what_the_frame_sees(tmp_path, suffix, of_frame):
