@@ -17,6 +17,8 @@ from jaxmap.geometry.cahv import CahvModel, make_cahv_model
 
 _COMPONENTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 7}
 
+_PRODUCT_KIND = re.compile(r"[0-9]{9,10}(?:_[0-9]{3})?([A-Z]{3}[A-Z_]?)")
+
 _DETECTORS_PX = (
     (r"MARS ?2020|\bM20\b", r"NAV|HAZ", (5120, 3840)),
     (r"MARS ?2020|\bM20\b|MSL|MARS SCIENCE", r"MCZ|ZCAM|MAST|MAHLI", (1648, 1200)),
@@ -41,6 +43,7 @@ class ProductLabel:
         site: the number of the site that the rover's poses refer to, None where it is unknown.
         rig: the instrument, `*` for the eye.
         eye: left or right.
+        product_kind: the three or four letters after the clock in the product's name, "" where there are none.
         clock_s: spacecraft clock at the start of the exposure.
         time_s: UTC in s since 1970, None where it is unknown.
     """
@@ -56,6 +59,7 @@ class ProductLabel:
     site: int | None
     rig: str
     eye: Literal["left", "right"]
+    product_kind: str
     clock_s: float
     time_s: float | None
 
@@ -71,7 +75,8 @@ def read_label(path: Path) -> ProductLabel | None:
         depth = product.dtypes[0] if bands else ""
         groups = read_groups(path, product)
     derived = str(find(groups, "DERIVED_IMAGE_TYPE", "DERIVED_IMAGE") or "IMAGE")
-    if bands not in (1, 3) or derived.upper() not in ("IMAGE", "N/A", "NULL", "UNK"):
+    points = bands == 3 and depth.startswith("float") and not find(groups, "DERIVED_IMAGE_TYPE")
+    if bands not in (1, 3) or points or derived.upper() not in ("IMAGE", "N/A", "NULL", "UNK"):
         return None
     if size_px[0] * size_px[1] > 2**28:
         raise JaxmapError(f"an image of {size_px[0]}x{size_px[1]} px", where=path, fix="restore the label")
@@ -90,6 +95,7 @@ def read_label(path: Path) -> ProductLabel | None:
         site=_site(groups),
         rig=rig,
         eye=eye,
+        product_kind=kind[1] if (kind := _PRODUCT_KIND.search(path.stem.upper())) else "",
         clock_s=_clock_s(groups, path),
         time_s=_time_s(groups),
     )
@@ -114,7 +120,7 @@ def _camera_model(groups: Groups, path: Path) -> tuple[CahvModel, str]:
         )
     lens = [numbers(group.get(f"MODEL_COMPONENT_{index}"), 1) for index in (8, 9)]
     type_, parameter = (default if one is None else float(one[0]) for one, default in zip(lens, (1, 1), strict=True))
-    frame = str(group.get("REFERENCE_COORD_SYSTEM_NAME", "")).strip().upper()
+    frame = str(group.get("REFERENCE_COORD_SYSTEM_NAME") or "ROVER_FRAME").strip().upper()
     return make_cahv_model(given, int(type_), float(parameter), path), frame
 
 
@@ -162,16 +168,17 @@ def _pair(groups: Groups, keys: tuple[str, str], names: tuple[str, ...]) -> np.n
 
 def _frames(groups: Groups) -> dict[str, tuple[str, np.ndarray]]:
     frames: dict[str, tuple[str, np.ndarray]] = {}
-    for group in groups.values():
+    for key, group in groups.items():
         quaternion = numbers(group.get("ORIGIN_ROTATION_QUATERNION"), 4)
         offset = numbers(group.get("ORIGIN_OFFSET_VECTOR"), 3)
-        name = str(group.get("COORDINATE_SYSTEM_NAME", "")).strip().upper()
+        # A group may name itself only: ROVER_COORDINATE_SYSTEM.
+        name = str(group.get("COORDINATE_SYSTEM_NAME") or key.replace("COORDINATE_SYSTEM", "FRAME")).strip().upper()
         if quaternion is None or offset is None or not name or abs(np.linalg.norm(quaternion) - 1) > 1e-2:
             continue
         T = np.eye(4)
         T[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
         T[:3, 3] = offset
-        parent = str(group.get("REFERENCE_COORD_SYSTEM_NAME", "")).strip().upper()
+        parent = str(group.get("REFERENCE_COORD_SYSTEM_NAME") or "SITE_FRAME").strip().upper()
         frames.setdefault(name, (parent, T))
     return frames
 
@@ -212,6 +219,12 @@ def _rig_and_eye(groups: Groups, path: Path) -> tuple[str, Literal["left", "righ
         found = re.search(r"(?<![A-Z])(LEFT|RIGHT)(?![A-Z])", text) or re.search(r"(?<![A-Z])[LR](?![A-Z])", text)
         if found:
             return text[: found.start()] + "*" + text[found.end() :], "left" if found[0][0] == "L" else "right"
+    frame = str(find(groups, "FRAME_ID", "IDENTIFICATION") or "").upper()
+    if frame in ("LEFT", "RIGHT"):
+        return (
+            f"{find(groups, 'INSTRUMENT_ID', 'IDENTIFICATION') or ''} *".upper(),
+            "left" if frame == "LEFT" else "right",
+        )
     stem = path.stem.upper()
     # MER: rover, camera, clock ... eye, filter; MSL and Mars 2020: camera, eye; MSL's colour cameras: sol, camera, eye.
     for form in (r"([0-9][A-Z])[0-9]{9}.{12}([LR])", r"([NFRZ])([LR])[A-Z0-9]_", r"[0-9]{4}(M)([LR])[0-9]"):

@@ -116,6 +116,8 @@ def _read_pixels(label: ProductLabel) -> np.ndarray:
     try:
         with opened_product(label.path) as product:
             bands = product.read()
+            if product.nodata is not None and bands.dtype != np.uint8:
+                bands[bands == product.nodata] = 0
     except JaxmapError as fault:
         raise FrameError(fault.what, where=fault.where, fix=fault.fix) from fault
     return bands[0] if len(bands) == 1 else np.ascontiguousarray(np.moveaxis(bands, 0, -1))
@@ -198,6 +200,8 @@ def _T_site_left(product: StereoProduct) -> np.ndarray | None:
     for _ in range(8):
         if _is_level(name):
             return T
+        if name not in product.left.frames and "ROVER" in name:
+            name = next((other for other in product.left.frames if "ROVER" in other), name)
         if name not in product.left.frames:
             return None
         name, T_parent_frame = product.left.frames[name]

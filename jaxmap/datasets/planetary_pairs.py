@@ -11,6 +11,9 @@ from jaxmap.datasets.pds_labels import ProductLabel, read_label
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.linearise import LinearPair, SharedView, linearise, share_view
 
+MAX_APART_S = 1.0
+"""Left and right whose clocks differ by less make a pair; the clocks of most pairs agree."""
+
 CAMERAS = (
     ("navcam", ("NAV", "N*")),
     ("front_hazcam", ("FHAZ", "FRONT", "F*")),
@@ -97,21 +100,17 @@ def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[t
     Raises:
         JaxmapError: there is no pair.
     """
-    eyes: defaultdict[tuple[str, int], dict[str, list[ProductLabel]]] = defaultdict(lambda: {"left": [], "right": []})
-    for label in labels:
-        eyes[label.rig, int(label.clock_s)][label.eye].append(label)
     pairs, lone, spare, unequal = [], 0, 0, 0
-    for both in eyes.values():
-        sizes = [{(label.size_px, label.bands) for label in its} for its in both.values()]
-        shared = sizes[0] & sizes[1]
+    for both in _exposures(labels):
+        forms = [{_form(label) for label in its} for its in both.values()]
+        shared = forms[0] & forms[1]
         if not shared:
-            lone += not (sizes[0] and sizes[1])
-            unequal += bool(sizes[0] and sizes[1])
+            lone += not (forms[0] and forms[1])
+            unequal += bool(forms[0] and forms[1])
             continue
-        form = max(shared, key=lambda form: (form[0][0] * form[0][1], form[1]))
         # The later name is the newer version of a product.
         left, right = (
-            max((label for label in its if (label.size_px, label.bands) == form), key=lambda label: label.path.stem)
+            max((label for label in its if _form(label) == max(shared)), key=lambda label: label.path.stem)
             for its in both.values()
         )
         pairs.append((left, right))
@@ -119,7 +118,7 @@ def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[t
     if lone:
         notes.append(f"{lone} exposures have one eye only and are left out")
     if unequal:
-        notes.append(f"{unequal} pairs have eyes of different sizes and are left out")
+        notes.append(f"{unequal} pairs have eyes of different sizes or kinds and are left out")
     if spare:
         notes.append(f"{spare} further products of the same exposures are left out: smaller ones, older versions")
     if not pairs:
@@ -127,9 +126,31 @@ def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[t
             f"no pair among {len(labels)} images: {lone} exposures have one eye only, {unequal} eyes of different "
             "sizes",
             where=folder,
-            fix="left and right must have the same SPACECRAFT_CLOCK_START_COUNT, in whole seconds, and one size",
+            fix="left and right must have one SPACECRAFT_CLOCK_START_COUNT, within 1 s, and one size",
         )
     return sorted(pairs, key=lambda pair: pair[0].clock_s)
+
+
+def _form(label: ProductLabel) -> tuple[int, tuple[int, int], int, str]:
+    """What both eyes of a pair must share; the greatest is the best."""
+    return label.size_px[0] * label.size_px[1], label.size_px, label.bands, label.product_kind
+
+
+def _exposures(labels: list[ProductLabel]) -> list[dict[str, list[ProductLabel]]]:
+    """The products of each exposure, by eye: of one clock reading, or two eyes less than `MAX_APART_S` apart."""
+    by_clock: defaultdict[tuple[str, float], dict[str, list[ProductLabel]]] = defaultdict(
+        lambda: {"left": [], "right": []}
+    )
+    for label in labels:
+        by_clock[label.rig, round(label.clock_s, 3)][label.eye].append(label)
+    lone_rights = [key for key, both in by_clock.items() if not both["left"]]
+    for key in sorted(key for key, both in by_clock.items() if not both["right"]):
+        near = [other for other in lone_rights if other[0] == key[0] and abs(other[1] - key[1]) < MAX_APART_S]
+        if near:
+            nearest = min(near, key=lambda other: abs(other[1] - key[1]))
+            lone_rights.remove(nearest)
+            by_clock[key]["right"] = by_clock.pop(nearest)["right"]
+    return list(by_clock.values())
 
 
 def of_one_site(

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.pds_labels import read_label
 from jaxmap.datasets.planetary import T_ENU_SITE
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
 
@@ -161,6 +161,82 @@ def test_a_part_of_the_frame_sees_what_the_frame_sees(tmp_path, suffix, of_frame
     _, same = product.left.model.rays(raw)
     np.testing.assert_allclose(ray, same, atol=1e-9)
     assert any("full frame" in note for note in part.notes) == of_frame
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "camera"),
+    [
+        ("2N126644134EFF0100P1506L0M1", "2N126644134EFF0100P1506R0M1", "navcam"),
+        ("NLA_397586934EDR_F0010008AUT_04096M1", "NRA_397586934EDR_F0010008AUT_04096M1", "navcam"),
+        ("FLB_397586934EDR_F0010008FHAZ00214M1", "FRB_397586934EDR_F0010008FHAZ00214M1", "front_hazcam"),
+        ("ZL0_0047_0671113936_000ECM_N0040048ZCAM00402_11J01", "ZR0_0047_0671113936_000ECM_N0040048ZCAM00402_11J01",
+         "mastcam_z"),
+    ],
+)  # fmt: skip
+def test_eyes_and_clocks_are_read_from_the_names_of_missions(tmp_path, left, right, camera):
+    for name, model in zip((left, right), scenes.rig(), strict=True):
+        groups = scenes.keywords(model, "CAHVOR", "left", 127168010.0)
+        groups[""] = {}
+        # All that is needed; the frames have no names.
+        rover = groups["ROVER_COORDINATE_SYSTEM"]
+        groups["ROVER_COORDINATE_SYSTEM"] = {key: rover[key] for key in rover if key.startswith("ORIGIN")}
+        groups["GEOMETRIC_CAMERA_MODEL"].pop("REFERENCE_COORD_SYSTEM_NAME")
+        scenes.write_pds3(tmp_path / f"{name}.IMG", np.zeros((48, 64), np.uint8), groups)
+    sequence = open_sequence(tmp_path, ReadOptions(camera=camera))
+    assert sequence.frames[0].name == left
+    clock_s = re.findall("[0-9]{9,10}", left)[0]
+    assert sequence.frames[0].timestamp_s == float(clock_s)
+
+
+def test_of_an_exposure_the_kind_that_both_eyes_have_is_taken(tmp_path):
+    """Eyes whose clocks read a little apart; a thumbnail, an older version, and a kind that one eye has."""
+    rig = scenes.rig()
+    for stem, shape, eyes in (
+        ("N{}A_397586934EDR_F0010008AUT_04096M1", (48, 64), "LR"),
+        ("N{}A_397586934EDR_F0010008AUT_04096M2", (48, 64), "LR"),
+        ("N{}A_397586934EDR_T0010008AUT_04096M1", (12, 16), "LR"),
+        ("N{}A_397586934RASLF0010008AUT_04096M1", (48, 64), "L"),
+    ):
+        for eye in eyes:
+            side = {"L": "left", "R": "right"}[eye]
+            groups = scenes.keywords(rig["LR".index(eye)], "CAHVOR", side, 127168010.9 + 0.2 * (eye == "R"))
+            scenes.write_pds3(tmp_path / f"{stem.format(eye)}.IMG", np.zeros(shape, np.uint8), groups)
+    sequence = open_sequence(tmp_path)
+    (frame,) = sequence.frames
+    assert (frame.left.stem, frame.right.stem) == (
+        "NLA_397586934EDR_F0010008AUT_04096M2",
+        "NRA_397586934EDR_F0010008AUT_04096M2",
+    )
+    assert any(note.startswith("5 further products") for note in sequence.notes)
+
+
+def test_pairs_half_a_second_apart_stay_apart(tmp_path):
+    for index in range(4):
+        write_pair(tmp_path, clock_s=127168010.0 + index)
+        for file in tmp_path.glob(f"*{127168010 + index}.IMG"):
+            half = file.read_bytes().replace(b"10.000", b"10.500") if index == 0 else None
+            if half:
+                (tmp_path / f"{file.stem}b.IMG").write_bytes(half)
+    assert len(open_sequence(tmp_path).frames) == 5
+
+
+def test_deep_pixels_are_scaled_by_one_number_for_the_sequence(tmp_path):
+    bright = {side: np.full(scenes.SIZE_PX[::-1], 3000, np.uint16) for side in ("left", "right")}
+    bright["left"][0, 0] = 30000
+    write_pair(tmp_path, pixels=bright)
+    write_pair(tmp_path, clock_s=127168040.0, pixels={side: image // 2 for side, image in bright.items()})
+    sequence = open_sequence(tmp_path)
+    first, second = (sequence.read_pair(frame).left[100, 100] for frame in sequence.frames)
+    assert (first, second) == (255, 127)
+
+
+def test_a_cut_image_is_a_frame_that_cannot_be_used(tmp_path):
+    write_pair(tmp_path)
+    sequence = open_sequence(tmp_path)
+    file = tmp_path / "R127168010.IMG"
+    file.write_bytes(file.read_bytes()[:-20000])
+    with pytest.raises(FrameError, match="not a whole"):
+        sequence.read_pair(sequence.frames[0])
 
 
 def refused(folder: Path, options: ReadOptions | None = None) -> str:
