@@ -44,13 +44,16 @@ def opened_product(path: Path) -> Iterator[DatasetReader]:
     # A label may name its image, and GDAL would follow such a name anywhere.
     if b"/vsi" in head or b"://" in head.partition(b"^IMAGE")[2].partition(b"\n")[0]:
         raise JaxmapError("the label points to a virtual file", where=path, fix="keep label and image in one folder")
+    if path.suffix.lower() == ".xml":
+        read_text(path)
     driver = "PDS4" if path.suffix.lower() == ".xml" else "VICAR" if head.startswith(b"LBLSIZE") else "PDS"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             with rasterio.open(path, driver=driver) as product:
                 yield product
-        except RasterioError as fault:
+        except (RasterioError, UnicodeDecodeError) as fault:
+            # GDAL quotes what it cannot read, and rasterio takes that for UTF-8.
             raise JaxmapError(
                 f"not a whole PDS3, PDS4 or VICAR image ({fault})", where=path, fix="restore label and image"
             ) from fault

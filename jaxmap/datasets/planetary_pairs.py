@@ -115,19 +115,19 @@ def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[t
         )
         pairs.append((left, right))
         spare += sum(map(len, both.values())) - 2
+    if not pairs:
+        raise JaxmapError(
+            f"no pair among {len(labels)} images: {lone} exposures have one eye only, {unequal} eyes of different "
+            f"sizes{'; ' * bool(notes)}{'; '.join(notes[:1])}",
+            where=folder,
+            fix="left and right must have one SPACECRAFT_CLOCK_START_COUNT, within 1 s, and one size",
+        )
     if lone:
         notes.append(f"{lone} exposures have one eye only and are left out")
     if unequal:
         notes.append(f"{unequal} pairs have eyes of different sizes or kinds and are left out")
     if spare:
         notes.append(f"{spare} further products of the same exposures are left out: smaller ones, older versions")
-    if not pairs:
-        raise JaxmapError(
-            f"no pair among {len(labels)} images: {lone} exposures have one eye only, {unequal} eyes of different "
-            "sizes",
-            where=folder,
-            fix="left and right must have one SPACECRAFT_CLOCK_START_COUNT, within 1 s, and one size",
-        )
     return sorted(pairs, key=lambda pair: pair[0].clock_s)
 
 

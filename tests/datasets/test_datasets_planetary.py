@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import planetary_scenes as scenes
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.pds_labels import read_label
 from jaxmap.datasets.planetary import T_ENU_SITE
-from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.errors import FrameError, JaxmapError, UsageError
+from jaxmap.runs.config import MapConfig
+from jaxmap.runs.mapping_plan import choose_label_folder
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
 
@@ -328,3 +332,41 @@ def test_real_labels_agree_with_themselves(tmp_path, realdata, name, lines, samp
     assert felt
     down_rover = label.frames["ROVER_NAV_FRAME"][1][2, :3]
     np.testing.assert_allclose(down_rover, [float(number) for number in felt.groups()], atol=1e-3)
+
+
+def test_labels_must_say_on_which_pixels_they_lie(tmp_path):
+    write_pair(tmp_path)
+    sequence = open_sequence(tmp_path)
+    (tmp_path / "labels").mkdir()
+    Image.fromarray(np.zeros(scenes.SIZE_PX[::-1], np.uint8)).save(tmp_path / "labels" / "L127168010.png")
+    config = MapConfig(labeller="files", labels=tmp_path / "labels")
+    with pytest.raises(UsageError, match="--labels-are raw"):
+        choose_label_folder(config, sequence)
+    folder = choose_label_folder(replace(config, labels_are="raw"), sequence)
+    labels = folder.read(sequence.frames[0], StereoFrontEnd(sequence.camera, StereoOptions()))["labels"]
+    assert (labels == 0).all()
+
+
+def test_mutated_labels_end_in_one_line(tmp_path):
+    rng = np.random.default_rng(11)
+    tokens = (b"1e308", b"nan", b"-1", b"9" * 400, b"(((((", b'"', b"\xff\xfe", b"\0", b"", b"END_GROUP", b"<", b"=")
+    small = dict.fromkeys(("left", "right"), BLANK)
+    outcomes = set()
+    for case in range(32):
+        suffix = list(scenes.WRITERS)[case % 4]
+        folder = tmp_path / str(case)
+        folder.mkdir()
+        write_pair(folder, suffix, "CAHVORE", pixels=small)
+        for file in folder.glob(f"*{suffix}"):
+            content = file.read_bytes()
+            words = [word.span() for word in re.finditer(rb"[-\w.]+", content[:3000])]
+            for start, stop in sorted((words[row] for row in rng.integers(0, len(words), 2)), reverse=True):
+                content = content[:start] + tokens[rng.integers(len(tokens))] + content[stop:]
+            file.write_bytes(content)
+        try:
+            sequence = open_sequence(folder, ReadOptions(dataset="planetary"))
+            sequence.read_pair(sequence.frames[0])
+            outcomes.add("read")
+        except JaxmapError:
+            outcomes.add("refused")
+    assert outcomes == {"read", "refused"}
