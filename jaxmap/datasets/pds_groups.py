@@ -19,7 +19,7 @@ from jaxmap.errors import JaxmapError
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
-LABEL_SUFFIXES = (".xml", ".lbl", ".img", ".vic")
+LABEL_SUFFIXES = (".xml", ".lbl", ".img", ".vic", ".vicar")
 """In the order in which they are tried where one image has several."""
 
 Groups = dict[str, dict[str, Any]]

@@ -14,8 +14,15 @@ from jaxmap.errors import JaxmapError, UsageError
 SAMPLE_PREFIX = "sample:"
 
 READERS: dict[str, Reader] = {
-    reader.name: reader
-    for reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER, planetary.READER, asp.READER)
+    module.READER.name: module.READER
+    for module in (
+        kitti,
+        euroc,
+        folder,
+        katwijk,
+        planetary,
+        asp,
+    )
 }
 
 
@@ -61,9 +68,10 @@ def _recognise(path: Path) -> Reader:
     """The one reader that recognises a folder."""
     fitting = [reader for reader in READERS.values() if reader.recognises(path)]
     if not fitting:
-        known = "; ".join(f"{reader.name}: {reader.help}" for reader in READERS.values())
         raise JaxmapError(
-            "no data set is recognised", where=path, fix=f"looked for {known}. Give the folder of one sequence"
+            f"no data set is recognised: looked for what marks {', '.join(READERS)}",
+            where=path,
+            fix="give the folder of one sequence; jaxmap info says what each must hold",
         )
     if len(fitting) > 1:
         names = " and ".join(reader.name for reader in fitting)
