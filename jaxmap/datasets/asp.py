@@ -20,12 +20,12 @@ from jaxmap.datasets.base import (
 )
 from jaxmap.datasets.images import image_size_px, list_images
 from jaxmap.datasets.options import ReadOptions
-from jaxmap.datasets.planetary import T_ENU_SITE
+from jaxmap.datasets.planetary import T_ENU_SITE, poses_of_rectified
 from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.geometry.tsai import TsaiCamera
-from jaxmap.stereo.linearise import EyeModel, PairRectifier, SharedView, linearise, share_view
+from jaxmap.stereo.linearise import PairRectifier, SharedView, linearise, share_view
 
 _LENSES = {
     "NULL": (),
@@ -129,7 +129,7 @@ def open_asp(folder: Path, options: ReadOptions) -> StereoSequence:
     def rectify_labels(frame: FrameRef, labels: np.ndarray) -> np.ndarray:
         return rectify.labels(rows[frame.name], labels)
 
-    track, T_child_camera = _poses(shared, folder, options, notes)
+    track = _poses(shared, folder, options, notes)
     # The world of the cameras' own poses is found out already.
     world = "z_up" if options.poses is None and options.poses_world == "auto" else options.poses_world
     camera = shared.pairs[0].camera
@@ -141,7 +141,6 @@ def open_asp(folder: Path, options: ReadOptions) -> StereoSequence:
         track=track,
         camera=camera,
         options=replace(options, calibration=None, poses_world=world),
-        T_child_camera=T_child_camera,
         notes=notes,
         read_pair=read_pair,
         size_px=(camera.width_px, camera.height_px),
@@ -149,13 +148,10 @@ def open_asp(folder: Path, options: ReadOptions) -> StereoSequence:
     return replace(sequence, rectify_labels=rectify_labels)
 
 
-def _poses(
-    shared: SharedView, folder: Path, options: ReadOptions, notes: list[str]
-) -> tuple[PoseTrack, np.ndarray | None]:
-    """The track, and the rectified left camera in its child frame where that is another one."""
+def _poses(shared: SharedView, folder: Path, options: ReadOptions, notes: list[str]) -> PoseTrack:
     if options.poses is not None:
-        track = read_pose_track(options, options.poses)
-        return track, np.stack([np.linalg.inv(_pose(pair.left)) @ pair.T_frame_left for pair in shared.pairs])
+        notes.append(poses_of_rectified(shared.pairs[0]))
+        return read_pose_track(options, options.poses)
     T = np.stack([pair.T_frame_left for pair in shared.pairs])
     if np.abs(T[:, :3, 3]).max() > _PLANET_M:
         raise JaxmapError(
@@ -167,13 +163,7 @@ def _poses(
     if options.poses_world == "auto" and -T[:, 2, 1].mean() < -0.3:
         T = T_ENU_SITE @ T
         notes.append("the cameras' world is taken for z down and turned z-up")
-    return make_pose_track(np.arange(float(len(T))), T, where=folder), None
-
-
-def _pose(camera: EyeModel) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = camera.axes, camera.centre
-    return T
+    return make_pose_track(np.arange(float(len(T))), T, where=folder)
 
 
 def _paired_files(folder: Path, calibration: Path | None) -> list[tuple[Path, Path, Path, Path]]:

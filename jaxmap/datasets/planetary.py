@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.options import ReadOptions
@@ -27,7 +28,7 @@ from jaxmap.datasets.planetary_pairs import (
 )
 from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.stereo.linearise import NEAR_M, PairRectifier, SharedView
+from jaxmap.stereo.linearise import NEAR_M, LinearPair, PairRectifier, SharedView
 
 T_ENU_SITE = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """From a site frame (x north, y east, z down) to x east, y north, z up."""
@@ -52,7 +53,7 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
     Left and right are told by INSTRUMENT_ID or the product's name, and pair up by the spacecraft clock. Images whose
     label has no camera model, eyes without partner, and pairs of another size, zoom or site than most are left out
     and counted. The poses are the labels' own, rover in site: x east, y north, z up; `--poses` replaces them, as
-    T_world_camera of the left camera (not rectified; x right, y down, z along its axis) or, as EuRoC csv, of the rover.
+    T_world_camera of the rectified left camera (what a run's poses.tum holds) or, as EuRoC csv, of the rover's frame.
 
     Raises:
         JaxmapError: no pair can be used, several cameras, no poses, or models that no linear pair holds.
@@ -74,7 +75,7 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
     ]
     camera = products[0].pair.camera
     read_pair = _PairReader(products, shared)
-    track, T_child_camera = _poses(products, times_s, options, folder)
+    track, T_child_camera = _poses(products, times_s, options, folder, notes)
     sequence = assemble(
         name=Path(os.path.abspath(folder)).name,
         dataset="planetary",
@@ -91,6 +92,15 @@ def open_planetary(folder: Path, options: ReadOptions) -> StereoSequence:
     )
     sequence = replace(sequence, rectify_labels=read_pair.rectify_labels)
     return sequence if options.poses else replace(sequence, T_world_source=T_ENU_SITE)
+
+
+def poses_of_rectified(pair: LinearPair) -> str:
+    """A note on which camera a file's poses are taken for, and how far it is turned from the raw left one."""
+    turn = Rotation.from_matrix(pair.T_frame_left[:3, :3].T @ pair.left.axes).magnitude()
+    return (
+        "the poses are taken for those of the rectified left camera, as a run's poses.tum holds them; it is turned by "
+        f"{np.degrees(turn):.2f} degrees from the left camera as it stands"
+    )
 
 
 class _PairReader:
@@ -168,12 +178,15 @@ def _times_s(products: Sequence[StereoProduct]) -> tuple[np.ndarray, str]:
 
 
 def _poses(
-    products: Sequence[StereoProduct], times_s: np.ndarray, options: ReadOptions, folder: Path
+    products: Sequence[StereoProduct], times_s: np.ndarray, options: ReadOptions, folder: Path, notes: list[str]
 ) -> tuple[PoseTrack, np.ndarray | None]:
     """The track, and the rectified left camera in its child frame where that is another one."""
     if options.poses is not None:
         track = read_pose_track(options, options.poses, allow_body=True)
-        return track, np.stack([_T_child_camera(product, track.child == "body") for product in products])
+        if track.child == "body":
+            return track, np.stack([product.pair.T_frame_left for product in products])
+        notes.append(poses_of_rectified(products[0].pair))
+        return track, None
     T_site_left = [_T_site_left(product) for product in products]
     known = [index for index, T in enumerate(T_site_left) if T is not None]
     if not known:
@@ -184,14 +197,6 @@ def _poses(
         )
     T = T_ENU_SITE @ np.stack([T for T in T_site_left if T is not None])
     return make_pose_track(times_s[known], T, where=folder), None
-
-
-def _T_child_camera(product: StereoProduct, of_rover: bool) -> np.ndarray:
-    if of_rover:
-        return product.pair.T_frame_left
-    T_frame_raw = np.eye(4)
-    T_frame_raw[:3, :3], T_frame_raw[:3, 3] = product.left.model.axes, product.left.model.C
-    return np.linalg.inv(T_frame_raw) @ product.pair.T_frame_left
 
 
 def _T_site_left(product: StereoProduct) -> np.ndarray | None:

@@ -117,8 +117,8 @@ def paired(labels: list[ProductLabel], folder: Path, notes: list[str]) -> list[t
         spare += sum(map(len, both.values())) - 2
     if not pairs:
         raise JaxmapError(
-            f"no pair among {len(labels)} images: {lone} exposures have one eye only, {unequal} eyes of different "
-            f"sizes{'; ' * bool(notes)}{'; '.join(notes[:1])}",
+            f"no pair among {len(labels)} images: {lone} exposures with one eye only, {unequal} with eyes of different "
+            f"sizes or kinds{'; ' * bool(notes)}{'; '.join(notes[:1])}",
             where=folder,
             fix="left and right must have one SPACECRAFT_CLOCK_START_COUNT, within 1 s, and one size",
         )

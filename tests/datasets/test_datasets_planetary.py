@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.pds_labels import read_label
 from jaxmap.datasets.planetary import T_ENU_SITE
+from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.runs.config import MapConfig
 from jaxmap.runs.mapping_plan import choose_label_folder
@@ -110,17 +111,20 @@ def test_poses_are_those_of_the_labels_for_every_pan_of_the_mast(tmp_path):
     assert sequence.read_pair._rectify._maps_of == [0, 0, 0]
 
 
-def test_poses_of_a_file_are_those_of_the_left_camera_as_it_stands(tmp_path):
-    write_pair(tmp_path)
-    left, _ = scenes.rig()
+def test_poses_of_a_file_are_those_that_a_run_writes_or_those_of_the_rover(tmp_path):
+    for index in range(2):
+        write_pair(tmp_path, clock_s=127168010.0 + 30 * index)
     own = open_sequence(tmp_path)
-    T_rover_raw = np.eye(4)
-    T_rover_raw[:3, :3], T_rover_raw[:3, 3] = left.axes, left.C
-    T = T_ENU_SITE @ T_SITE_ROVER @ T_rover_raw
-    poses = tmp_path / "poses.tum"
-    numbers = [own.frames[0].timestamp_s, *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
-    poses.write_text(" ".join(map(repr, map(float, numbers))))
-    given = open_sequence(tmp_path, ReadOptions(poses=poses, poses_world="z_up"))
+    times_s = np.array([frame.timestamp_s for frame in own.frames])
+    write_tum(tmp_path / "poses.tum", times_s, own.T_world_camera)
+    given = open_sequence(tmp_path, ReadOptions(poses=tmp_path / "poses.tum", poses_world="z_up"))
+    np.testing.assert_allclose(given.T_world_camera, own.T_world_camera, atol=1e-6)
+    assert any("rectified left camera" in note for note in given.notes)
+    T = T_ENU_SITE @ T_SITE_ROVER
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    rows = [",".join(map(str, [int(time_s) * 10**9, *T[:3, 3], w, x, y, z])) for time_s in times_s]
+    (tmp_path / "rover.csv").write_text("#timestamp,px,py,pz,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
+    given = open_sequence(tmp_path, ReadOptions(poses=tmp_path / "rover.csv", poses_world="z_up"))
     np.testing.assert_allclose(given.T_world_camera, own.T_world_camera, atol=1e-6)
 
 
