@@ -83,6 +83,7 @@ def read_label(path: Path) -> ProductLabel | None:
     model, model_frame = _camera_model(groups, path)
     fitted = _for_stored_pixels(model, groups, size_px)
     rig, eye = _rig_and_eye(groups, path)
+    time_s = _time_s(groups)
     return ProductLabel(
         path=path,
         size_px=size_px,
@@ -96,8 +97,8 @@ def read_label(path: Path) -> ProductLabel | None:
         rig=rig,
         eye=eye,
         product_kind=kind[1] if (kind := _PRODUCT_KIND.search(path.stem.upper())) else "",
-        clock_s=_clock_s(groups, path),
-        time_s=_time_s(groups),
+        clock_s=_clock_s(groups, path, time_s),
+        time_s=time_s,
     )
 
 
@@ -192,13 +193,19 @@ def _site(groups: Groups) -> int | None:
     return None
 
 
-def _clock_s(groups: Groups, path: Path) -> float:
-    text = str(find(groups, "SPACECRAFT_CLOCK_START_COUNT", "IDENTIFICATION") or "")
-    named = re.search(r"(?<![0-9])[0-9]{9,10}(?![0-9])", path.stem)
-    for found in (numbers(text.rpartition("/")[2].strip('" '), 1), numbers(named and named[0], 1)):
-        if found is not None:
-            return float(found[0])
-    raise JaxmapError("the label has no SPACECRAFT_CLOCK_START_COUNT", where=path, fix="restore the label")
+def _clock_s(groups: Groups, path: Path, time_s: float | None) -> float:
+    """The spacecraft clock: of the label, else of the product's name, else the time."""
+    said = str(find(groups, "SPACECRAFT_CLOCK_START_COUNT", "IDENTIFICATION") or "").rpartition("/")[2]
+    found = re.search(r"[0-9]{1,12}(\.[0-9]{1,6})?", said)
+    named = (re.search(r"(?<![0-9])[0-9]{9,10}(?![0-9])", name) for name in _names(groups, path))
+    found = found or next((match for match in named if match), None)
+    if found is None and time_s is None:
+        raise JaxmapError("the label has no SPACECRAFT_CLOCK_START_COUNT", where=path, fix="restore the label")
+    return float(found[0]) if found else float(time_s or 0.0)
+
+
+def _names(groups: Groups, path: Path) -> tuple[str, str]:
+    return path.stem.upper(), str(find(groups, "PRODUCT_ID", "IDENTIFICATION") or "").upper()
 
 
 def _time_s(groups: Groups) -> float | None:
@@ -221,14 +228,13 @@ def _rig_and_eye(groups: Groups, path: Path) -> tuple[str, Literal["left", "righ
             return text[: found.start()] + "*" + text[found.end() :], "left" if found[0][0] == "L" else "right"
     frame = str(find(groups, "FRAME_ID", "IDENTIFICATION") or "").upper()
     if frame in ("LEFT", "RIGHT"):
-        return (
-            f"{find(groups, 'INSTRUMENT_ID', 'IDENTIFICATION') or ''} *".upper(),
-            "left" if frame == "LEFT" else "right",
-        )
-    stem = path.stem.upper()
+        rig = f"{find(groups, 'INSTRUMENT_ID', 'IDENTIFICATION') or ''} *".upper()
+        return rig, "left" if frame == "LEFT" else "right"
     # MER: rover, camera, clock ... eye, filter; MSL and Mars 2020: camera, eye; MSL's colour cameras: sol, camera, eye.
-    for form in (r"([0-9][A-Z])[0-9]{9}.{12}([LR])", r"([NFRZ])([LR])[A-Z0-9]_", r"[0-9]{4}(M)([LR])[0-9]"):
-        found = re.match(form, stem)
-        if found:
-            return f"{found[1]}*", "left" if found[2] == "L" else "right"
+    forms = (r"([0-9][A-Z])[0-9]{9}.{12}([LR])", r"([NFRZ])([LR])[A-Z0-9]_", r"[0-9]{4}(M)([LR])[0-9]")
+    for name in _names(groups, path):
+        for form in (*forms, r"()(?:.*[^A-Z])?(LEFT|RIGHT)(?![A-Z])"):
+            found = re.match(form, name)
+            if found:
+                return f"{found[1]}*", "left" if found[2][0] == "L" else "right"
     raise JaxmapError("neither label nor name say which eye this is", where=path, fix="INSTRUMENT_ID names it")

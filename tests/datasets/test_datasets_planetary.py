@@ -196,6 +196,15 @@ def test_eyes_and_clocks_are_read_from_the_names_of_missions(tmp_path, left, rig
     assert sequence.frames[0].timestamp_s == float(clock_s)
 
 
+def test_plain_names_and_times_do_where_labels_say_no_more(tmp_path):
+    for side, model in zip(("left", "right"), scenes.rig(), strict=True):
+        groups = scenes.keywords(model, "CAHVOR", side, 127168010.0)
+        groups[""] = {"START_TIME": "2004-012T08:31:57.705"}
+        scenes.write_pds3(tmp_path / f"rock_{side}.IMG", np.zeros((48, 64), np.uint8), groups)
+    sequence = open_sequence(tmp_path)
+    assert (sequence.frames[0].name, sequence.frames[0].timestamp_s) == ("rock_left", 1073896317.705)
+
+
 def test_of_an_exposure_the_kind_that_both_eyes_have_is_taken(tmp_path):
     """Eyes whose clocks read a little apart; a thumbnail, an older version, and a kind that one eye has."""
     rig = scenes.rig()
