@@ -172,6 +172,8 @@ def _paired_files(folder: Path, calibration: Path | None) -> list[tuple[Path, Pa
         left, right = _two_cameras(folder, calibration)
         images = list_images(folder / "left")
         return [(image, folder / "right" / image.name, left, right) for image in images]
+    if calibration is not None:
+        raise JaxmapError("each image has its own camera beside it", where="--calibration", fix="leave the option out")
     by_key: dict[str, dict[str, Path]] = {}
     for image in list_images(folder):
         eye = _EYE.search(image.stem)

@@ -78,7 +78,7 @@ def read_label(path: Path) -> ProductLabel | None:
     points = bands == 3 and depth.startswith("float") and not find(groups, "DERIVED_IMAGE_TYPE")
     if bands not in (1, 3) or points or derived.upper() not in ("IMAGE", "N/A", "NULL", "UNK"):
         return None
-    if size_px[0] * size_px[1] > 2**28:
+    if size_px[0] * size_px[1] > 2**26:
         raise JaxmapError(f"an image of {size_px[0]}x{size_px[1]} px", where=path, fix="restore the label")
     model, model_frame = _camera_model(groups, path)
     fitted = _for_stored_pixels(model, groups, size_px)

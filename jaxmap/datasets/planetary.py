@@ -144,14 +144,16 @@ def _white_level(labels: Sequence[ProductLabel], count: int = 8) -> float:
 
     It is the 99.9th percentile of several images, so that no hot pixel decides it.
     """
-    brightest = [1.0]
+    brightest: list[float] = []
     for index in np.unique(np.linspace(0, len(labels) - 1, count).astype(int)) if labels else ():
         try:
-            pixels = _read_pixels(labels[index])[::2, ::2].astype(np.float32)
+            pixels = _read_pixels(labels[index])[::2, ::2]
         except FrameError:
             continue
-        brightest.append(float(np.quantile(np.nan_to_num(pixels), 0.999)))
-    return max(brightest)
+        white = float(np.quantile(np.nan_to_num(pixels.astype(np.float32)), 0.999))
+        # Eight bits of a dark image stay as dark as they are; radiances have no such scale.
+        brightest.append(white if pixels.dtype.kind == "f" else max(white, 255.0))
+    return max((white for white in brightest if white > 0), default=1.0)
 
 
 def _check_residual(shared: SharedView, folder: Path, notes: list[str]) -> None:

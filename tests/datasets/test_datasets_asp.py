@@ -104,6 +104,8 @@ def test_lone_images_and_cameras_of_a_planet_are_refused(tmp_path):
     write_scene(tmp_path, ("one", "two"))
     assert "no pairs of images with cameras" in refused(open_sequence, tmp_path)
     write_scene(tmp_path)
+    options = ReadOptions(calibration=tmp_path / "rock_left.tsai")
+    assert "leave the option out" in refused(open_sequence, tmp_path, options)
     for file in tmp_path.glob("rock_*.tsai"):
         file.write_text(file.read_text().replace("C = 0.5", "C = 3396190.5"))
     assert "planetocentric" in refused(open_sequence, tmp_path)

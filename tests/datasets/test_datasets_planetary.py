@@ -247,6 +247,13 @@ def test_deep_pixels_are_scaled_by_one_number_for_the_sequence(tmp_path):
     assert (first, second) == (255, 127)
 
 
+def test_what_is_dark_stays_dark(tmp_path):
+    dim = {side: np.full(scenes.SIZE_PX[::-1], 40, np.uint16) for side in ("left", "right")}
+    write_pair(tmp_path, pixels=dim)
+    sequence = open_sequence(tmp_path)
+    assert sequence.read_pair(sequence.frames[0]).left[100, 100] == 40
+
+
 def test_a_cut_image_is_a_frame_that_cannot_be_used(tmp_path):
     write_pair(tmp_path)
     sequence = open_sequence(tmp_path)
