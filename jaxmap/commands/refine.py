@@ -61,7 +61,7 @@ class RefineArguments:
     max_depth_m: Positive | None = None
     """Farther points are not used; by default those whose depth noise exceeds 0.35 m."""
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder or katwijk."""
+    """The reader: auto, kitti, euroc, folder, katwijk, planetary or asp."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     calibration: Path | None = None

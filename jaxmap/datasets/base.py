@@ -61,6 +61,8 @@ class StereoSequence:
         crs: the coordinate reference system of `site_origin`, e.g. "EPSG:32631", or None.
         notes: what the reader reports to the user (frames left out, conventions assumed).
         read_pair: reads the images of one frame.
+        rectify_labels: where `read_pair` rectifies: the same for labels (H, W) or probabilities (H, W, C) of the left
+            image of a frame as it lies on disk; else None.
     """
 
     name: str
@@ -73,6 +75,7 @@ class StereoSequence:
     site_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    rectify_labels: Callable[[FrameRef, np.ndarray], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)

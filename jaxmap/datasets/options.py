@@ -52,7 +52,7 @@ class ReadOptions:
     """
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder, katwijk, rosbag, madmax, tartanair or middlebury."""
+    """The reader: auto, kitti, euroc, folder, katwijk, planetary, asp, rosbag, madmax, tartanair or middlebury."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: PosesWorld = "auto"
@@ -60,7 +60,8 @@ class ReadOptions:
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
     camera: str | None = None
-    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam; planetary archives:
+    navcam, front_hazcam, rear_hazcam, pancam, mastcam, mastcam_z or other."""
     antenna_m: tuple[Offset, Offset, Offset] | None = None
     """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
