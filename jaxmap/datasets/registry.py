@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmap.datasets import asp, euroc, folder, katwijk, kitti, planetary, rosbag
+from jaxmap.datasets import (
+    asp,
+    euroc,
+    folder,
+    katwijk,
+    kitti,
+    madmax,
+    middlebury,
+    planetary,
+    rosbag,
+    tartanair,
+)
 from jaxmap.datasets.base import Reader, StereoSequence
 from jaxmap.datasets.crs import check_crs
 from jaxmap.datasets.options import ReadOptions
@@ -23,6 +34,9 @@ READERS: dict[str, Reader] = {
         planetary,
         asp,
         rosbag,
+        madmax,
+        tartanair,
+        middlebury,
     )
 }
 
@@ -56,7 +70,7 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
         return open_sample(str(source).removeprefix(SAMPLE_PREFIX), options)
     path = Path(source)
     if not path.is_dir() and not (path.is_file() and any(reader.recognises(path) for reader in READERS.values())):
-        what = f"{source} is a file, and no bag" if path.exists() else f"there is no folder {source}"
+        what = f"{source} is a file, but no bag" if path.exists() else f"there is no folder {source}"
         raise JaxmapError(what, fix="give the folder of one sequence, a bag, or sample:NAME")
     reader = READERS[options.dataset] if options.dataset != "auto" else _recognise(path)
     if options.camera is not None and options.camera not in reader.cameras:
