@@ -6,7 +6,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from jaxmap.host.settings import Positive, options
+from jaxmap.host.settings import AnyNumber, Place, Positive, count, options
 
 PosesWorld = Literal["auto", "z_up", "z_down", "y_up", "camera"]
 """World of a pose file: z up; x north, y east, z down; x right, y up, z backward; x right, y down, z forward; or
@@ -24,6 +24,8 @@ LengthUnit = Literal["m", "cm", "mm"]
 
 Bits = Literal[8, 10, 12, 14, 16]
 """What cameras deliver; files that hold more than 8 hold 16."""
+
+Offset = Annotated[float, AnyNumber]
 
 
 @options("bag")
@@ -65,7 +67,7 @@ class ReadOptions:
     """
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder, katwijk, rosbag, madmax, tartanair or middlebury."""
+    """The reader: auto, kitti, euroc, folder, katwijk, planetary, asp, rosbag, madmax, tartanair or middlebury."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: PosesWorld = "auto"
@@ -88,19 +90,19 @@ class ReadOptions:
     """Camera file in place of the sequence's own."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam; KITTI: grey (the default)
-    or color."""
+    or color; planetary archives: navcam, front_hazcam, rear_hazcam, pancam, mastcam, mastcam_z or other."""
     image_bits: Bits | None = None
     """Bits that 16-bit images use: 8, 10, 12, 14 or 16; by default found from several images of both cameras."""
-    antenna_m: tuple[float, float, float] | None = None
+    antenna_m: tuple[Offset, Offset, Offset] | None = None
     """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
     max_pose_gap_s: Annotated[float, Positive] = 1.0
     """Poses farther apart are not bridged."""
-    start: int = 0
+    start: Annotated[int, Place] = 0
     """First frame."""
-    stop: int | None = None
+    stop: Annotated[int, Place] | None = None
     """Frame to stop before, from the end if negative; by default the end."""
-    stride: Annotated[int, Positive] = 1
+    stride: Annotated[int, count(2**31 - 1)] = 1
     """Take every so many frames."""
     bag: BagOptions = field(default_factory=BagOptions)
