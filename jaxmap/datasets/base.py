@@ -8,7 +8,9 @@ them to `assemble`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,10 +18,16 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmap.datasets.calibration import read_mounting
-from jaxmap.datasets.images import ImageArray, first_image_size_px, read_image_pair
-from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.images import (
+    ImageArray,
+    first_image_size_px,
+    image_rotation_tag,
+    read_image_pair,
+    sequence_bits,
+)
+from jaxmap.datasets.options import Bits, ReadOptions
 from jaxmap.datasets.poses import PoseTrack, poses_at, read_poses, split_site_origin, to_z_up, with_timestamps
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
 
@@ -93,13 +101,16 @@ class Reader:
     cameras: tuple[str, ...] = ()
 
 
-def read_stereo_pair(frame: FrameRef) -> StereoPair:
+def read_stereo_pair(
+    frame: FrameRef, *, bits: Bits | None = None, size_px: tuple[int, int] | None = None
+) -> StereoPair:
     """Reads the images of one frame, see `images.read_image_pair`.
 
     Raises:
-        FrameError: an image cannot be read, or the two differ in size.
+        FrameError: an image cannot be read, or has another size than asked for or than the other one.
     """
-    return StereoPair(*read_image_pair(frame.left, frame.right, where=f"frame {frame.name} ({frame.right})"))
+    where = f"frame {frame.name} ({frame.right})"
+    return StereoPair(*read_image_pair(frame.left, frame.right, where, bits=bits, size_px=size_px))
 
 
 def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False) -> PoseTrack:
@@ -141,7 +152,7 @@ def assemble(
     T_child_camera: Float64[np.ndarray, "*frames 4 4"] | None = None,
     crs: str | None = None,
     notes: Sequence[str] = (),
-    read_pair: Callable[[FrameRef], StereoPair] = read_stereo_pair,
+    read_pair: Callable[[FrameRef], StereoPair] | None = None,
 ) -> StereoSequence:
     """Joins frames, poses and calibration into a sequence in a z-up world.
 
@@ -160,7 +171,7 @@ def assemble(
             where the child frame is the left camera.
         crs: the coordinate reference system of the poses.
         notes: what the reader reports to the user.
-        read_pair: reads the images of one frame.
+        read_pair: reads the images of one frame; by default from its files, with one depth of bits for all frames.
 
     Raises:
         JaxmapError: frames out of order, counts that disagree, an image of another size than the
@@ -204,6 +215,9 @@ def assemble(
             f"{len(selected) - len(kept)} of {len(selected)} frames have no pose and are left out: "
             f"the frames span {_span(timestamps_s[selected])}, the poses {_span(track.timestamps_s)}"
         )
+    if read_pair is None:
+        bits = _bits(frames, options, all_notes)
+        read_pair = partial(read_stereo_pair, bits=bits, size_px=(camera.width_px, camera.height_px))
     row_of_frame = np.cumsum(has_pose) - 1
     return StereoSequence(
         name=name,
@@ -238,6 +252,25 @@ def _check_frames(
             where=where,
             fix="give the calibration of these images",
         )
+
+
+def _bits(frames: Sequence[FrameRef], options: ReadOptions, notes: list[str]) -> Bits | None:
+    """How many bits 16-bit images use, as given or found; what was taken is noted, and a rotation tag, too."""
+    with suppress(FrameError):
+        if (tag := image_rotation_tag(frames[0].left)) != 1:
+            notes.append(
+                f"the images carry the rotation tag {tag}, which is not applied: calibration, labels and masks must "
+                "refer to the pixels as they are stored"
+            )
+    found = sequence_bits([(frame.left, frame.right) for frame in frames])
+    if found is None:
+        return options.image_bits
+    if options.image_bits is None:
+        notes.append(
+            f"the 16-bit images are taken to use {found.bits} bits ({100 * found.brighter:.2g} % of their pixels are "
+            "brighter, and become white); --image-bits sets it"
+        )
+    return options.image_bits or found.bits
 
 
 def _span(timestamps_s: np.ndarray) -> str:

@@ -13,6 +13,10 @@ PosesWorld = Literal["auto", "z_up", "camera"]
 Offset = Annotated[float, AnyNumber]
 
 
+Bits = Literal[8, 10, 12, 14, 16]
+"""What cameras deliver; files that hold more than 8 hold 16."""
+
+
 @options("")
 class ReadOptions:
     """How a sequence is read, and which of its frames.
@@ -33,7 +37,10 @@ class ReadOptions:
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
     camera: str | None = None
-    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam; KITTI: grey (the default)
+    or color."""
+    image_bits: Bits | None = None
+    """Bits that 16-bit images use: 8, 10, 12, 14 or 16; by default found from several images of both cameras."""
     antenna_m: tuple[Offset, Offset, Offset] | None = None
     """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
