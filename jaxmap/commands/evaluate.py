@@ -74,6 +74,7 @@ def main(words: Sequence[str]) -> int:
     keep_compiled_programs()
     console = Console()
     folder = RunFolder(arguments.run)
+    folder.settle_for_reading()
     out, picture = folder.scores, folder.errors
     if arguments.out is not None:
         out, picture = arguments.out, arguments.out.with_name(f"{arguments.out.stem}_errors.png")

@@ -31,7 +31,7 @@ class MapArguments:
     """
 
     sequence: tyro.conf.Positional[str]
-    """Folder of one sequence, or sample:motorcycle."""
+    """Folder of one sequence, a ROS bag, or sample:motorcycle."""
     out: Path
     """The run folder to write; not the sequence's own folder."""
     config: str | None = None
@@ -39,7 +39,7 @@ class MapArguments:
     resume: bool = False
     """Resume an interrupted run."""
     overwrite: bool = False
-    """Replace a run that lies in the folder."""
+    """Replace a run that lies in the folder; it stays until the new one is whole."""
     checkpoint_every_s: Annotated[float, NotNegative] = 30.0
     """How often the map is saved on the way."""
     profile: bool = False
@@ -69,11 +69,15 @@ def main(words: Sequence[str]) -> int:
     folder = RunFolder(arguments.out)
     plan = plan_run(arguments.sequence, config, console.notify)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
-    with folder.locked(), console.progress("mapping", len(plan.sequence.frames)) as advance:
-        folder.begin(plan.settings(config), resume=arguments.resume, overwrite=arguments.overwrite)
+    resume, overwrite = arguments.resume, arguments.overwrite
+    with (
+        folder.locked(),
+        folder.writing(plan.settings(config), resume=resume, overwrite=overwrite) as work,
+        console.progress("mapping", len(plan.sequence.frames)) as advance,
+    ):
         metrics = run_plan(
             plan,
-            folder,
+            work,
             strict=config.strict,
             checkpoint_every_s=arguments.checkpoint_every_s,
             notify=console.notify,

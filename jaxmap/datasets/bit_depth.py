@@ -44,6 +44,14 @@ def used_bits(images: Iterable[UInt16[np.ndarray, "H W *rgb"]]) -> BitDepth:
     return BitDepth(bits, float((values >= 2**bits).mean()))
 
 
+def bits_note(bits: int, brighter: float) -> str:
+    """What a reader tells of the depth that it found."""
+    return (
+        f"the 16-bit images are taken to use {bits} bits ({100 * brighter:.2g} % of their pixels are brighter, and "
+        "become white); --image-bits sets it"
+    )
+
+
 def to_8_bits(pixels: UInt8[np.ndarray, "H W *rgb"] | UInt16[np.ndarray, "H W *rgb"], bits: int) -> np.ndarray:
     """Shifts 16-bit pixels that use so many bits down to uint8, brighter ones to 255; 8-bit pixels stay as they are."""
     if pixels.dtype == np.uint8:

@@ -155,18 +155,6 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def remove(path: Path) -> None:
-    """Removes a file, if it is there.
-
-    Raises:
-        JaxmapError: the operating system refused.
-    """
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_error(error, path) from error
-
-
 def write_error(error: OSError, where: object) -> JaxmapError:
     """An error for a failure of the operating system while writing `where`."""
     if error.errno in _FULL:

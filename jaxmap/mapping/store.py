@@ -191,6 +191,12 @@ def holds_map(path: str | os.PathLike[str]) -> bool:
     return target.exists() or _set_aside(target).exists()
 
 
+def stray_maps(path: str | os.PathLike[str]) -> list[Path]:
+    """What saves that were cut off have left beside a map."""
+    target = Path(path)
+    return [_set_aside(target), *target.parent.glob(f".{target.name}.new-*")]
+
+
 def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[VoxelMap, MapAttributes]:
     """Reads a map; where a save was cut off between its renames, the map from before it.
 

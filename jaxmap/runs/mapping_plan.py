@@ -142,13 +142,14 @@ def choose_label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFol
         raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
     labels_are = config.labels_are
     if labels_are == "auto":
-        if isinstance(sequence.camera, StereoRig):
+        if isinstance(sequence.camera, StereoRig) or sequence.rectify_labels is not None:
             raise UsageError(
                 "the images are raw, and labels may lie on raw or on rectified pixels",
                 fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
             )
         labels_are = "rectified"
-    return open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
+    folder = open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
+    return replace(folder, rectify=sequence.rectify_labels)
 
 
 def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
@@ -162,7 +163,7 @@ def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None
         if config.model is not None:
             raise UsageError(
                 f"--model is given, but the labeller is {config.labeller}",
-                fix="add --labeller deeplab, or leave it out",
+                fix="take --labeller deeplab, or leave it out",
             )
         return None, None
     path = config.model or bundled("rover.safetensors")
@@ -212,10 +213,12 @@ def choose_labeller(
         deeplab, shrink = config.deeplab, BUNDLED_WIDTH_PX / camera.width_px
         if config.model is None and deeplab.size_px is None and shrink < 1:
             deeplab = replace(deeplab, size_px=(round(shrink * camera.height_px), BUNDLED_WIDTH_PX))
-        return _with_relief(make_deeplab_labeller(network, classes, deeplab), config)
+        labeller = make_deeplab_labeller(network, classes, deeplab)
+        known = {config.relief.ground, config.relief.rock} <= set(labeller.classes)
+        return _with_relief(labeller, config, by_default=known)
     classes = ROVER_CLASSES if classes is None else classes
     if label_folder is not None:
-        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config)
+        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config, by_default=False)
     if config.labeller == "relief":
         return make_relief_labeller(classes, config.relief)
     if config.labeller == "plane":
@@ -223,8 +226,9 @@ def choose_labeller(
     return make_no_labeller()
 
 
-def _with_relief(labeller: Labeller, config: MapConfig) -> Labeller:
-    return combine_with_relief(labeller, config.relief) if config.relief.combine else labeller
+def _with_relief(labeller: Labeller, config: MapConfig, *, by_default: bool) -> Labeller:
+    combine = by_default if config.relief.combine is None else config.relief.combine
+    return combine_with_relief(labeller, config.relief) if combine else labeller
 
 
 Notify = Callable[[str], None]
@@ -299,6 +303,8 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         JaxmapError: the data or the settings do not serve.
     """
     sequence = open_sequence(source, config)
+    if config.strict and sequence.pose_faults:
+        raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
     front_end = StereoFrontEnd(sequence.camera, config.stereo)
     camera = front_end.camera
     _describe_sequence(sequence, camera, notify)
