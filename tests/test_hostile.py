@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 import yaml
 from fixtures import finished_run, scene_folder, shared_cache  # noqa: F401
-from hostile import FILE_CHANGES, TEXT_CHANGES, Campaign, Change, flip_bytes, replace_number, replace_value
+from hostile import FILE_CHANGES, TEXT_CHANGES, Campaign, Change, TooLong, flip_bytes, replace_number, replace_value
 from planned_runs import config_of, planned
 from truth_files import CRS, SITE, write_raster
 
 from jaxmap.datasets.crs import Extent
 from jaxmap.datasets.label_raster import read_coding, read_label_orthomosaic
+from jaxmap.errors import JaxmapError
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.store import load_map
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.config import config_tree, load_config
 from jaxmap.runs.evaluation import read_cameras
+from jaxmap.runs.folder import RunFolder, write_exports
 
 SEQUENCE_FILES: dict[str, tuple[Change, ...]] = {
     "camera.yaml": TEXT_CHANGES,
@@ -40,6 +42,19 @@ RUN_FILES: dict[str, tuple[Change, ...]] = {
 }
 TEXTS = [replace_number, replace_value, flip_bytes]
 COUNTS = [pytest.param(12, id="quick"), pytest.param(150, id="all", marks=pytest.mark.slow)]
+
+
+def test_a_campaign_notices():
+    campaign = Campaign(seed=0)
+    with campaign.trial("one line"):
+        raise JaxmapError("what", where="where", fix="do this")
+    campaign.check()
+    for fault in (ValueError("what"), RecursionError(), MemoryError(), TooLong()):
+        with campaign.trial("a fault"):
+            raise fault
+    assert len(campaign.faults) == 4
+    with pytest.raises(AssertionError, match="a fault: ValueError: what"):
+        campaign.check()
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -88,7 +103,7 @@ def test_hostile_ground_truth(count, tmp_path):
 
 @pytest.mark.slow
 def test_hostile_runs(finished_run, tmp_path):
-    """A run folder of somebody else's: reading its map and its cameras, and writing its report."""
+    """A run folder of somebody else's: going on with it, and exporting and reporting it again."""
     campaign = Campaign(seed=7)
     for trial in range(80):
         run = Path(shutil.copytree(finished_run, tmp_path / str(trial)))
@@ -98,7 +113,9 @@ def test_hostile_runs(finished_run, tmp_path):
         change(run / name, campaign.rng)
         with campaign.trial(f"run {trial}, {change.__name__} {name}"):
             read_cameras(run, np.zeros(3))
-            load_map(run / "map.zarr", members=True)
+            saved = RunFolder(run).resume_point()
+            assert saved is not None
+            write_exports(RunFolder(run), *load_map(run / "map.zarr"))
             write_report(run)
         shutil.rmtree(run)
     campaign.check()

@@ -235,13 +235,7 @@ def assemble(
     assert track.timestamps_s is not None
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
 
-    selected = np.arange(len(frames))[options.start : options.stop : options.stride]
-    if not len(selected):
-        raise JaxmapError(
-            f"start {options.start}, stop {options.stop}, stride {options.stride} select none of {len(frames)} frames",
-            where=where,
-            fix="choose another range",
-        )
+    selected = _selected(len(frames), options, where)
     kept = selected[has_pose[selected]]
     if not len(kept):
         raise _no_pose(timestamps_s[selected], track, options)
@@ -281,6 +275,18 @@ def assemble(
             poses_world=next(name for name, T in T_Z_UP_SOURCE.items() if np.array_equal(T, T_world_source))
         ),
     )
+
+
+def _selected(count: int, options: ReadOptions, where: object) -> np.ndarray:
+    """The indices of the frames that `start`, `stop` and `stride` select."""
+    selected = np.arange(count)[options.start : options.stop : options.stride]
+    if not len(selected):
+        raise JaxmapError(
+            f"start {options.start}, stop {options.stop}, stride {options.stride} select none of {count} frames",
+            where=where,
+            fix="choose another range",
+        )
+    return selected
 
 
 def _check_frames(

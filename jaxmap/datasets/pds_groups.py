@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import warnings
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import numpy as np
 
 from jaxmap.datasets.text_files import read_text
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import parse_json
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -86,8 +86,8 @@ def read_groups(path: Path, product: DatasetReader) -> Groups:
             # rasterio takes the document for `KEY=VALUE`; it was cut at the first `:` or `=`.
             for separator in (":", "="):
                 try:
-                    tree = json.loads(key + separator + value)
-                except (ValueError, RecursionError):
+                    tree = parse_json(key + separator + value, path)
+                except JaxmapError:
                     continue
                 groups: Groups = {"": {}}
                 _collect(tree, "", groups)

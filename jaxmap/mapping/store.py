@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import check_regular, sync, write_error
-from jaxmap.host.memory import most_memory_bytes
+from jaxmap.host.memory import available_bytes
 from jaxmap.types import GridSpec, VoxelMap, to_device
 
 if TYPE_CHECKING:
@@ -111,11 +111,11 @@ def _check_form(array: zarr.Array, name: str, where: Path) -> None:
         JaxmapError: it is one.
     """
     # A chunk is read whole, also where the array is smaller.
-    count, most_bytes = max(math.prod(array.shape), math.prod(array.chunks)), most_memory_bytes()
-    if 4 * count > most_bytes:
+    count, free_bytes = max(math.prod(array.shape), math.prod(array.chunks)), available_bytes()
+    if free_bytes is not None and 4 * count > free_bytes:
         raise JaxmapError(
-            f"{name} of {' x '.join(map(str, array.shape))} takes {4 * count / 2**30:.3g} GiB, this machine has "
-            f"{most_bytes / 2**30:.3g}",
+            f"{name} of {' x '.join(map(str, array.shape))} takes {4 * count / 2**30:.3g} GiB, there are "
+            f"{free_bytes / 2**30:.3g}",
             where=where,
             fix="read it on a larger machine, or make the map again",
         )

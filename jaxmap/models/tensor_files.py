@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import read_json
 from jaxmap.models.file_kinds import kind_of_weights
 from jaxmap.models.torch_files import Choose, Tensors, all_of, from_bfloat16, read_torch_file
 
@@ -16,7 +16,6 @@ _FLOATS = {"F16": np.float16, "F32": np.float32, "F64": np.float64}
 _BFLOAT16 = "BF16"
 _TORCH_SUFFIXES = (".pth", ".pt", ".bin", ".ckpt", ".tar")
 _INDEX = ".index.json"
-_MAX_INDEX_BYTES = 2**25
 
 
 def read_tensors(path: Path, choose: Choose = all_of) -> Tensors:
@@ -68,15 +67,11 @@ def _shards(index: Path) -> list[Path]:
         JaxmapError: it is no index, or shards are missing.
     """
     try:
-        if index.stat().st_size > _MAX_INDEX_BYTES:
-            raise ValueError("it is too large")
-        places = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
+        places = read_json(index)["weight_map"]
         names = sorted({str(name) for name in places.values()})
         if not names or any(Path(name).name != name for name in names):
             raise ValueError("weight_map does not name files beside it")
-    except FileNotFoundError as fault:
-        raise JaxmapError("no such file", where=index, fix="check the path") from fault
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as fault:
+    except (ValueError, KeyError, TypeError, AttributeError) as fault:
         reason = f"{type(fault).__name__}: {' '.join(str(fault).split())[:100]}"
         raise JaxmapError(f"no index of shards ({reason})", where=index, fix="download it again") from fault
     missing = [name for name in names if not (index.parent / name).is_file()]

@@ -91,14 +91,12 @@ def run_plan(
             on_frame(fused)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
-                _write_key_frames(plan, folder, key_frames)
-                save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
+                _save(plan, folder, log, voxel_map, key_frames)
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
-            _write_key_frames(plan, folder, key_frames)
-            save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
+            _save(plan, folder, log, voxel_map, key_frames)
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
@@ -115,6 +113,14 @@ def run_plan(
     for note in _notes(log, metrics):
         notify(f"note: {note}")
     return metrics
+
+
+def _save(
+    plan: Plan, folder: RunFolder, log: RunLog, voxel_map: VoxelMap, key_frames: list[tuple[PreparedFrame, int]]
+) -> None:
+    """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
+    _write_key_frames(plan, folder, key_frames)
+    save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
 
 
 def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
