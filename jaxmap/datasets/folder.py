@@ -17,7 +17,11 @@ from jaxmap.errors import JaxmapError
 
 _TIME_FILES = ("times.txt", "timestamps.txt")
 
-SIDES = (("left", "right"), ("image_left", "image_right"), ("image_0", "image_1"), ("cam0", "cam1"))
+SIDES = (
+    *(("left", "right"), ("Left", "Right"), ("left_images", "right_images")),
+    *(("image_left", "image_right"), ("images_left", "images_right"), ("cam_left", "cam_right")),
+    *(("image_0", "image_1"), ("image_00", "image_01"), ("cam0", "cam1"), ("cam_0", "cam_1")),
+)
 """Names of the two folders of images, in order of preference."""
 _OWN_FILES = ("camera.yaml", "poses.tum")
 
