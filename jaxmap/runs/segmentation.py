@@ -249,9 +249,8 @@ class LabelWriter:
                     scores.images = counted + 1
         step = -(-max(size) // OVERVIEW_PX)
         small = labels[::step, ::step]
-        self._write(
-            path, labels, overlay_labels(read_decimated(path, small.shape, self.bits), small, self.segmenter.classes)
-        )
+        overview = read_decimated(path, small.shape, self.bits)
+        self._write(path, labels, overlay_labels(overview, small, self.segmenter.classes))
 
     def _write(self, path: Path, labels: np.ndarray, overlay: np.ndarray) -> None:
         for suffix, picture in (("", labels), ("_overlay", overlay)):

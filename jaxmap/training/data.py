@@ -227,11 +227,8 @@ def digest(training_set: TrainingSet) -> str:
         text.update(f"{len(part)}\n".encode())
         for example in part:
             stereo = () if example.stereo is None else stereo_paths(example.stereo, example.name)
-            sizes = (
-                *example.size_px,
-                *filter(None, [example.bits]),
-                *map(_file_size, (example.image, example.mask, *stereo)),
-            )
+            sizes = (*example.size_px, *map(_file_size, (example.image, example.mask, *stereo)))
+            sizes += () if example.bits is None else (example.bits,)
             text.update(os.fsencode(f"{example.name}\0{sizes}\n"))
     return text.hexdigest()
 

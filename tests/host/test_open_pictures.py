@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 import jaxmap
-from jaxmap.errors import FrameError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.pictures import open_picture
+from jaxmap.report.page import inline_image
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (6, 9, 3), np.uint8)
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n"
@@ -56,6 +57,12 @@ def test_no_other_format_is_opened_whatever_its_name(tmp_path, content, monkeypa
     path = tmp_path / "000001.png"
     path.write_bytes(content)
     assert refused(path) == f"not an image of a known format in {path}; give PNG, JPEG, TIFF, BMP, PGM, PPM or WebP"
+
+
+def test_a_report_opens_no_other_format_either(tmp_path):
+    (tmp_path / "bev.png").write_bytes(EPS)
+    with pytest.raises(JaxmapError, match=r"not a readable picture in .*bev\.png; remove it or map again"):
+        inline_image(tmp_path / "bev.png", "map")
 
 
 def test_a_large_size_is_refused_by_the_header(tmp_path):
