@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from jaxmap.commands.console import Console, parse
+from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.datasets.options import Bits
 from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.host.settings import count
+
+Edge = Annotated[int, count(8192)]
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class SegmentArguments:
     """A model file, as train and weights import write it."""
     out: Path
     """Folder to write."""
-    size: tuple[int, int] | None = None
+    size: tuple[Edge, Edge] | None = None
     """Height and width that the network runs at; each image's own without it."""
     image_bits: Bits | None = None
     """Bits that 16-bit images use: 8, 10, 12, 14 or 16; by default found in each image."""
@@ -51,6 +55,7 @@ COLUMNS = {"name": "class", "iou": "IoU", "precision": "precision", "recall": "r
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(SegmentArguments, "segment", words)
+    check_bounds(arguments, "segment")
     if not arguments.images:
         raise UsageError("no images", where="the command line", fix="name image files or folders")
     if arguments.masks is None and (arguments.remap or arguments.palette):

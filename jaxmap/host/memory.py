@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 _TUNABLES = "GLIBC_TUNABLES"
@@ -51,15 +53,22 @@ def peak_resident_mib() -> float:
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def available_bytes() -> int | None:
-    """The memory that a program may still take, or None where the system does not say."""
-    status = Path("/proc/meminfo")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            name, _, value = line.partition(":")
-            if name == "MemAvailable":
-                return int(value.split()[0]) * 2**10
-    return None
+def most_memory_bytes() -> int:
+    """The memory that this process may use at most: what the machine has, or what a container or a limit leaves it."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    if (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
+        limits.append(limit)
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):
+            limits.append(int(Path("/sys/fs/cgroup", name).read_text()))
+    return min(limits)
+
+
+def available_bytes() -> int:
+    """The memory that this process may still take, as far as the system says."""
+    status, most = Path("/proc/meminfo"), most_memory_bytes()
+    found = re.search(r"^MemAvailable:\s+([0-9]+) kB", status.read_text() if status.exists() else "", re.M)
+    return min(int(found[1]) * 2**10, most) if found else most
 
 
 def _is_supported() -> bool:

@@ -62,8 +62,8 @@ class Segmenter:
             where="the network",
             fix="run it smaller with --size H W",
         )
-        free = available_bytes() if height * width > LARGE_PX and jax.default_backend() == "cpu" else None
-        if free is not None and self._needed_bytes((height, width)) > free:
+        large = height * width > LARGE_PX and jax.default_backend() == "cpu"
+        if large and self._needed_bytes((height, width)) > available_bytes():
             raise too_large
         try:
             return np.asarray(self._run(self._weights, as_rgb(image)[None])[0])
@@ -225,9 +225,8 @@ class LabelWriter:
     def _label_large(self, path: Path, mask: Path | None, scores: SegmentationScores, size: Size, wanted: Size) -> None:
         """The same for a picture that is never held as more than one number a pixel; its overlay is smaller than it."""
         height, width = size
-        free = available_bytes()
         # Its labels, and as much again while they are compressed.
-        if free is not None and 2 * height * width > free:
+        if 2 * height * width > available_bytes():
             raise FrameError(
                 f"the labels of an image of {width}x{height} px take more memory than there is",
                 where=path,
