@@ -273,10 +273,7 @@ def _bits(frames: Sequence[FrameRef], options: ReadOptions, notes: list[str]) ->
     if found is None:
         return options.image_bits
     if options.image_bits is None:
-        notes.append(
-            f"the 16-bit images are taken to use {found.bits} bits ({100 * found.brighter:.2g} % of their pixels are "
-            "brighter, and become white); --image-bits sets it"
-        )
+        notes.append(found.note)
     return options.image_bits or found.bits
 
 

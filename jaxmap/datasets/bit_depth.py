@@ -23,6 +23,14 @@ class BitDepth(NamedTuple):
     bits: Bits
     brighter: float
 
+    @property
+    def note(self) -> str:
+        """What was found, for the user."""
+        return (
+            f"the 16-bit images are taken to use {self.bits} bits ({100 * self.brighter:.2g} % of their pixels are "
+            "brighter, and become white); --image-bits sets it"
+        )
+
 
 def used_bits(images: Iterable[UInt16[np.ndarray, "H W *rgb"]]) -> BitDepth:
     """The least depth that holds all but `BRIGHT_SHARE` of the pixels of 16-bit images.

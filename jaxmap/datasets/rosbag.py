@@ -32,7 +32,7 @@ from jaxmap.datasets.bag_topics import (
 from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.bit_depth import used_bits
 from jaxmap.datasets.calibration import read_camera_yaml
-from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.options import Bits, ReadOptions
 from jaxmap.datasets.pairing import nearest_pairs
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
@@ -66,7 +66,8 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
         found = _bag_poses(log, (poses, bag.topics[poses].type), imu, shots[0][0].frame, times_s, options)
     if gps is not None and imu is None:
         found = georeferenced(found, log, gps, options)
-    reader = _PairReader(bag, pair, {str(left.time_ns): (left.place, right.place) for left, right in shots})
+    places = {str(left.time_ns): (left.place, right.place) for left, right in shots}
+    reader = _PairReader(bag, pair, places, options.image_bits)
     camera, more = _camera(log, infos, pair, shots[0], times_s, options)
     usual = Counter(left.size_px for left, _ in shots if left.size_px).most_common(1)
     return assemble(
@@ -82,7 +83,7 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
         options=options,
         T_child_camera=found.T_child_camera,
         crs=found.crs,
-        notes=[*notes, *more, *found.notes],
+        notes=[*notes, *more, *found.notes, *reader.notes],
         read_pair=reader,
         size_px=usual[0][0] if usual else reader.size_px,
     )
@@ -189,10 +190,13 @@ class _PairReader:
 
     Attributes:
         size_px: width and height of the first image that can be decoded.
+        notes: how many bits were found.
     """
 
-    def __init__(self, bag: Bag, pair: PairTopics, places: Mapping[str, tuple[Place, Place]]) -> None:
-        """Decodes a few pairs.
+    def __init__(
+        self, bag: Bag, pair: PairTopics, places: Mapping[str, tuple[Place, Place]], bits: Bits | None
+    ) -> None:
+        """Decodes a few pairs; `bits` is how many deep images use, where it is known.
 
         Raises:
             FrameError: none of them can be decoded.
@@ -210,7 +214,9 @@ class _PairReader:
             raise fault
         self.size_px = (probes[0].shape[1], probes[0].shape[0])
         deep = [image for image in probes if image.dtype == np.uint16]
-        self._bits = used_bits(deep).bits if deep else 8
+        found = used_bits(deep) if deep and bits is None else None
+        self.notes = [] if found is None else [found.note]
+        self._bits = bits or (8 if found is None else found.bits)
 
     def __call__(self, frame: FrameRef) -> StereoPair:
         """The pair of a frame.

@@ -14,7 +14,7 @@ from PIL import Image
 
 import jaxmap
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.host.pictures import open_picture
+from jaxmap.host.pictures import check_encoded, open_picture
 from jaxmap.report.page import inline_image
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (6, 9, 3), np.uint8)
@@ -72,6 +72,15 @@ def test_a_large_size_is_refused_by_the_header(tmp_path):
     assert "the image is 300x200 px, more" in refused(path, max_px=50_000)
 
 
+def test_encoded_pictures_are_bounded_too(tmp_path):
+    data = huge_png(tmp_path / "bomb.png", 60_000, 60_000).read_bytes()
+    with pytest.raises(FrameError, match=r"the image is 60000x60000 px, more than the 134 million .* in /camera at 12"):
+        check_encoded(data, "/camera at 12")
+    with pytest.raises(FrameError, match="the image cannot be read"):
+        check_encoded(data[:20], "/camera at 12")
+    check_encoded(huge_png(tmp_path / "small.png", 9, 6).read_bytes(), "/camera at 12")
+
+
 def test_only_regular_files_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe.png")
     assert "cannot be read (no regular file)" in refused(tmp_path / "pipe.png")
@@ -83,4 +92,5 @@ def test_the_package_opens_pictures_nowhere_else():
     package = Path(jaxmap.__file__).parent
     opening = re.compile(r"\bImage\.open\(|\bimread\w*\(|\bimdecode\w*\(")
     found = {path.relative_to(package).as_posix() for path in package.rglob("*.py") if opening.search(path.read_text())}
-    assert found <= {"datasets/images.py"}  # decodes what `open_picture` opened
+    # These decode what was opened or checked here.
+    assert found <= {"datasets/images.py", "datasets/bag_images.py"}
