@@ -23,14 +23,6 @@ class BitDepth(NamedTuple):
     bits: Bits
     brighter: float
 
-    @property
-    def note(self) -> str:
-        """What was found, for the user."""
-        return (
-            f"the 16-bit images are taken to use {self.bits} bits ({100 * self.brighter:.2g} % of their pixels are "
-            "brighter, and become white); --image-bits sets it"
-        )
-
 
 def used_bits(images: Iterable[UInt16[np.ndarray, "H W *rgb"]]) -> BitDepth:
     """The least depth that holds all but `BRIGHT_SHARE` of the pixels of 16-bit images.
@@ -50,6 +42,14 @@ def used_bits(images: Iterable[UInt16[np.ndarray, "H W *rgb"]]) -> BitDepth:
     bright = np.quantile(seen, 1 - BRIGHT_SHARE) if len(seen) else _TOP
     bits = next(bits for bits in get_args(Bits) if bright < 2**bits)
     return BitDepth(bits, float((values >= 2**bits).mean()))
+
+
+def bits_note(bits: int, brighter: float) -> str:
+    """What a reader tells of the depth that it found."""
+    return (
+        f"the 16-bit images are taken to use {bits} bits ({100 * brighter:.2g} % of their pixels are brighter, and "
+        "become white); --image-bits sets it"
+    )
 
 
 def to_8_bits(pixels: UInt8[np.ndarray, "H W *rgb"] | UInt16[np.ndarray, "H W *rgb"], bits: int) -> np.ndarray:

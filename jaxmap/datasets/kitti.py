@@ -12,9 +12,9 @@ from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.images import first_image_size_px, list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import read_timestamps, with_timestamps
+from jaxmap.datasets.projections import camera_of_projections
 from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
-from jaxmap.types import StereoCamera, make_stereo_camera
 
 CAMERAS = {"grey": (0, 1), "color": (2, 3)}
 """Numbers of the left and the right camera by the names that `ReadOptions.camera` takes."""
@@ -46,7 +46,7 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
     if options.calibration:
         camera = read_camera_yaml(options.calibration)
     else:
-        camera = _camera(
+        camera = camera_of_projections(
             P_left, P_right, first_image_size_px((frame.left for frame in frames), folder), folder / "calib.txt"
         )
 
@@ -121,22 +121,6 @@ def _projections(path: Path, left: int, right: int) -> tuple[np.ndarray, np.ndar
     if absent:
         raise JaxmapError(f"no line {' or '.join(absent)}", where=path, fix="restore the file")
     return matrices[f"P{left}"], matrices[f"P{right}"]
-
-
-def _camera(P_left: np.ndarray, P_right: np.ndarray, size_px: tuple[int, int], path: Path) -> StereoCamera:
-    if not np.allclose(P_left[[0, 1, 1], [0, 1, 2]], P_right[[0, 1, 1], [0, 1, 2]], rtol=1e-3):
-        raise JaxmapError("the two cameras differ", where=path, fix="give a rectified pair, or a --calibration")
-    return make_stereo_camera(
-        fx_px=float(P_left[0, 0]),
-        fy_px=float(P_left[1, 1]),
-        cx_px=float(P_left[0, 2]),
-        cy_px=float(P_left[1, 2]),
-        baseline_m=float((P_left[0, 3] - P_right[0, 3]) / P_left[0, 0]),
-        doffs_px=float(P_right[0, 2] - P_left[0, 2]),
-        width_px=size_px[0],
-        height_px=size_px[1],
-        where=path,
-    )
 
 
 READER = Reader(

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmap.datasets.pairing import nearest_pairs
+from jaxmap.datasets.units import PER_SECOND, unit_by_size
 from jaxmap.errors import JaxmapError
 
 _LEFT, _RIGHT = "left|cam_?0|camera_?0|l|0", "right|cam_?1|camera_?1|r|1"
@@ -80,8 +81,7 @@ def is_number(name: str) -> bool:
 
 def units_per_second(times: np.ndarray) -> float:
     """Seconds up to 1e11, then milliseconds, from 1e14 on microseconds, from 1e17 on nanoseconds."""
-    largest = np.abs(times).max()
-    return next((count for least, count in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest >= least), 1.0)
+    return PER_SECOND[unit_by_size(float(np.abs(times).max())) or "s"]
 
 
 def _without_side(stem: str, words: str) -> str:

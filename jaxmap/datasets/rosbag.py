@@ -30,7 +30,7 @@ from jaxmap.datasets.bag_topics import (
     is_rectified_name,
 )
 from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.bit_depth import used_bits
+from jaxmap.datasets.bit_depth import bits_note, used_bits
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.options import Bits, ReadOptions
 from jaxmap.datasets.pairing import nearest_pairs
@@ -56,6 +56,9 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
     by_gps = poses is not None and bag.topics[poses].type == FIX_TYPE
     imu = attitude_topic(bag.topics, options.bag, path) if by_gps else None
     log = read_log(bag, {*pair, *infos, *(name for name in (poses, gps, imu) if name is not None)})
+    for topic in (*pair, *infos):
+        if topic not in (log.infos if topic in infos else log.shots):
+            raise JaxmapError(f"no message of {topic} can be found", where=path, fix="restore the bag, or reindex it")
 
     shots, more = _pair_shots(log, pair, options.bag.max_pair_gap_s, path)
     notes += more + _notes_on_log(log, infos)
@@ -83,7 +86,7 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
         options=options,
         T_child_camera=found.T_child_camera,
         crs=found.crs,
-        notes=[*notes, *more, *found.notes, *reader.notes],
+        notes=[*notes, *reader.notes, *more, *found.notes],
         read_pair=reader,
         size_px=usual[0][0] if usual else reader.size_px,
     )
@@ -196,7 +199,7 @@ class _PairReader:
     def __init__(
         self, bag: Bag, pair: PairTopics, places: Mapping[str, tuple[Place, Place]], bits: Bits | None
     ) -> None:
-        """Decodes a few pairs; `bits` is how many deep images use, where it is known.
+        """Decodes a few pairs.
 
         Raises:
             FrameError: none of them can be decoded.
@@ -214,9 +217,10 @@ class _PairReader:
             raise fault
         self.size_px = (probes[0].shape[1], probes[0].shape[0])
         deep = [image for image in probes if image.dtype == np.uint16]
-        found = used_bits(deep) if deep and bits is None else None
-        self.notes = [] if found is None else [found.note]
-        self._bits = bits or (8 if found is None else found.bits)
+        self.notes, self._bits = [], bits or 16
+        if deep and bits is None:
+            self._bits, brighter = used_bits(deep)
+            self.notes.append(bits_note(self._bits, brighter))
 
     def __call__(self, frame: FrameRef) -> StereoPair:
         """The pair of a frame.
