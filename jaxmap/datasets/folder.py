@@ -29,7 +29,10 @@ _OWN_FILES = ("camera.yaml", "poses.tum")
 def recognises(folder: Path) -> bool:
     """Whether the folder holds `left` and `right`, or others of `SIDES` and `camera.yaml` or `poses.tum`."""
     sides = _sides(folder)
-    return sides is not None and (sides == SIDES[0] or any((folder / name).is_file() for name in _OWN_FILES))
+    if sides is None or sides == SIDES[0]:
+        return sides is not None
+    # TartanAir's folders of images have such names, too.
+    return any((folder / name).is_file() for name in _OWN_FILES) and not (folder / "pose_left.txt").is_file()
 
 
 def _sides(folder: Path) -> tuple[str, str] | None:
