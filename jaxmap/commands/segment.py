@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from jaxmap.commands.console import Console, check_bounds, parse
+from jaxmap.datasets.options import Bits
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.settings import count
 
@@ -34,6 +35,8 @@ class SegmentArguments:
     """Folder to write."""
     size: tuple[Edge, Edge] | None = None
     """Height and width that the network runs at; each image's own without it."""
+    image_bits: Bits | None = None
+    """Bits that 16-bit images use: 8, 10, 12, 14 or 16; by default found in each image."""
     masks: Path | None = None
     """Folder of true labels, NAME.png of class indices (255: none), to score against."""
     remap: dict[str, str] | None = None
@@ -85,7 +88,7 @@ def main(words: Sequence[str]) -> int:
     console = Console()
     for note in [*rotation_notes(images), *(check_masks(images, masks, lookup) if masks else [])]:
         console.notify(f"note: {note}")
-    writer = LabelWriter(segmenter, arguments.out, lookup, arguments.save_logits)
+    writer = LabelWriter(segmenter, arguments.out, lookup, arguments.save_logits, arguments.image_bits)
     with console.steps("labelling", "images", len(images)) as advance:
         scores, faults = label_images(writer, images, masks, advance=advance)
     if masks:

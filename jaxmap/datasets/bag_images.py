@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxmap.datasets.bit_depth import to_8_bits
 from jaxmap.errors import FrameError
+from jaxmap.host.pictures import check_encoded
 
 _CHANNELS = {
     **{"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4},
@@ -114,6 +115,8 @@ def _decode_compressed(message: Any, where: object) -> np.ndarray:
             f"a compressed image of format {str(message.format)[:60]!r}", where=where, fix="JPEG and PNG are read"
         )
     whole = _COMPRESSED[kind][1] in end
+    if whole:
+        check_encoded(data.tobytes(), where)
     pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION) if whole else None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"a {kind} image that is cut off or damaged", where=where, fix="restore the bag")

@@ -17,7 +17,11 @@ from jaxmap.errors import JaxmapError
 
 _TIME_FILES = ("times.txt", "timestamps.txt")
 
-SIDES = (("left", "right"), ("image_left", "image_right"), ("image_0", "image_1"), ("cam0", "cam1"))
+SIDES = (
+    *(("left", "right"), ("Left", "Right"), ("left_images", "right_images")),
+    *(("image_left", "image_right"), ("images_left", "images_right"), ("cam_left", "cam_right")),
+    *(("image_0", "image_1"), ("image_00", "image_01"), ("cam0", "cam1"), ("cam_0", "cam_1")),
+)
 """Names of the two folders of images, in order of preference."""
 _OWN_FILES = ("camera.yaml", "poses.tum")
 
@@ -25,7 +29,10 @@ _OWN_FILES = ("camera.yaml", "poses.tum")
 def recognises(folder: Path) -> bool:
     """Whether the folder holds `left` and `right`, or others of `SIDES` and `camera.yaml` or `poses.tum`."""
     sides = _sides(folder)
-    return sides is not None and (sides == SIDES[0] or any((folder / name).is_file() for name in _OWN_FILES))
+    if sides is None or sides == SIDES[0]:
+        return sides is not None
+    # TartanAir's folders of images have such names, too.
+    return any((folder / name).is_file() for name in _OWN_FILES) and not (folder / "pose_left.txt").is_file()
 
 
 def _sides(folder: Path) -> tuple[str, str] | None:

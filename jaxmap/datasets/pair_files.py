@@ -26,7 +26,7 @@ class FilePairs(NamedTuple):
 
     Attributes:
         right: the partner of each left image, None where it has none; one that should be there may be missing.
-        keys: the names of the left images without suffix and without the word for the side.
+        keys: the names of the left images without suffix and word for the side; of a time, the number alone.
         notes: how they were paired, and how many images are left over.
     """
 
@@ -85,14 +85,19 @@ def units_per_second(times: np.ndarray) -> float:
 
 
 def _without_side(stem: str, words: str) -> str:
-    """A name without the word for its side at the beginning or the end, set off by a mark or, if long, a digit."""
+    """A name without the word for its side at the beginning or the end, set off by a mark or, if long, a digit.
+
+    Of a name that ends in a time, such as `img_1700000000.25` or `1700000000_250000000` (s, ns), the time is left.
+    """
     if is_number(stem):
         return stem
     long = words.split("|")[0]
-    found = re.sub(
-        rf"^(?:(?:{words})[-_.]+|{long}(?=[0-9]))|(?:[-_.]+(?:{words})|(?<=[0-9]){long})$", "", stem, flags=re.I
-    )
-    return found or stem
+    pattern = rf"^(?:(?:{words})[-_.]+|{long}(?=[0-9]))|(?:[-_.]+(?:{words})|(?<=[0-9]){long})$"
+    name = re.sub(pattern, "", stem, flags=re.IGNORECASE) or stem
+    if found := re.fullmatch(r"(?:[A-Za-z_-]*[A-Za-z][-_]*)?([0-9]{9,10})[-_]([0-9]{9})", name):
+        return f"{found[1]}.{found[2]}"
+    found = re.fullmatch(r"[A-Za-z_-]*[A-Za-z][-_]*([0-9]+(?:\.[0-9]+)?)", name)
+    return found[1] if found and is_time(found[1]) else name
 
 
 def _by_time(keys: Sequence[str], right_keys: Sequence[str], left: Sequence[Path], right: Sequence[Path]) -> FilePairs:

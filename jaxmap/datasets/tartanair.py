@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.folder import recognises as is_plain_folder
 from jaxmap.datasets.images import first_image_size_px, list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack
@@ -47,8 +48,8 @@ _LAYOUTS = (
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds the two image folders of a version."""
-    return _layout(folder) is not None
+    """Whether the folder holds the two image folders of a version, and is no plain folder with a camera or poses."""
+    return _layout(folder) is not None and not is_plain_folder(folder)
 
 
 def open_tartanair(folder: Path, options: ReadOptions) -> StereoSequence:

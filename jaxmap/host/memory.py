@@ -52,8 +52,8 @@ def peak_resident_mib() -> float:
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def available_bytes() -> int | None:
-    """The memory that a program may still take, or None where the system does not say.
+def available_bytes() -> int:
+    """The memory that a program may still take; without bound where the system does not say.
 
     It is what the system has left, or what a container or a limit of the process allows where that is less.
     """
@@ -65,7 +65,7 @@ def available_bytes() -> int | None:
         limits.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
     if (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
         limits.append(limit)
-    return min(limits, default=None)
+    return min(limits, default=sys.maxsize)
 
 
 def _is_supported() -> bool:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from PIL import (
@@ -72,7 +73,21 @@ def open_picture(path: Path, noun: str = "image", *, max_px: int | None = MAX_PX
         ) from fault
 
 
-def _identified(file, path: Path, noun: str, max_px: int | None) -> ImageFile.ImageFile:
+def check_encoded(data: bytes, where: object) -> None:
+    """Refuses an encoded picture, as of a message, by what its first bytes declare.
+
+    Raises:
+        FrameError: none of `FORMATS`, damaged, or too large.
+    """
+    try:
+        _identified(BytesIO(data), where, "image", MAX_PX)
+    except JaxmapError:
+        raise
+    except Exception as fault:  # as above
+        raise FrameError(f"the image cannot be read ({fault})", where=where, fix="restore the data") from fault
+
+
+def _identified(file: IO[bytes], path: object, noun: str, max_px: int | None) -> ImageFile.ImageFile:
     start = file.read(16)
     file.seek(0)
     kind = next((kind for magic, kind in _KINDS.items() if start.startswith(magic)), None)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxmap.datasets.bit_depth import to_8_bits, used_bits
+from jaxmap.datasets.options import Bits
 from jaxmap.errors import FrameError
 from jaxmap.host.pictures import Turn, open_picture, oriented, size_of, turn_of
 from jaxmap.models.resizing import resize_taps
@@ -26,12 +27,13 @@ Size = tuple[int, int]
 """Height and width in pixels."""
 
 
-def read_decimated(path: Path, size: Size) -> UInt8[np.ndarray, "h w *rgb"]:
+def read_decimated(path: Path, size: Size, bits: Bits | None = None) -> UInt8[np.ndarray, "h w *rgb"]:
     """Reads a picture of any size, as viewers show it, at a smaller size: GDAL averages it while it is decoded.
 
     Args:
         path: the picture.
         size: the wanted height and width; what comes is never larger than the picture itself.
+        bits: how many a 16-bit picture uses; found by default.
 
     Raises:
         FrameError: the file is missing, broken, or of a rare kind of pixels.
@@ -66,7 +68,7 @@ def read_decimated(path: Path, size: Size) -> UInt8[np.ndarray, "h w *rgb"]:
         pixels = np.array([palette.get(index, (0, 0, 0))[:3] for index in range(256)], np.uint8)[pixels[0]]
         pixels = pixels.transpose(2, 0, 1)
     elif pixels.dtype == np.uint16:
-        pixels = to_8_bits(pixels, used_bits(list(pixels)).bits)
+        pixels = to_8_bits(pixels, bits or used_bits(list(pixels)).bits)
     elif levels < 255:
         pixels = pixels * np.uint8(255 // levels)
     image = pixels[0] if len(pixels) == 1 else np.ascontiguousarray(pixels.transpose(1, 2, 0))

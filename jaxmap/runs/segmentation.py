@@ -14,6 +14,7 @@ from PIL import Image
 
 from jaxmap.datasets.images import as_rgb, image_size_px, list_images, read_image
 from jaxmap.datasets.masks import MaskLookup, find_mask, read_labels, unlabelled_notes
+from jaxmap.datasets.options import Bits
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.host.files import atomic_path
@@ -61,7 +62,8 @@ class Segmenter:
             where="the network",
             fix="run it smaller with --size H W",
         )
-        if height * width > LARGE_PX and self._needed_bytes((height, width)) > (available_bytes() or float("inf")):
+        large = height * width > LARGE_PX and jax.default_backend() == "cpu"
+        if large and self._needed_bytes((height, width)) > available_bytes():
             raise too_large
         try:
             return np.asarray(self._run(self._weights, as_rgb(image)[None])[0])
@@ -185,12 +187,14 @@ class LabelWriter:
         out: the folder to write.
         lookup: what the pixels of masks stand for.
         save_logits: whether the logits are written as well.
+        bits: how many 16-bit images use; found in each by default.
     """
 
     segmenter: Segmenter
     out: Path
     lookup: MaskLookup
     save_logits: bool = False
+    bits: Bits | None = None
 
     def label(self, path: Path, mask: Path | None, scores: SegmentationScores) -> None:
         """Labels one image, as viewers show it, and scores the labels against a mask.
@@ -204,7 +208,7 @@ class LabelWriter:
             self._label_large(path, mask, scores, (height, width), wanted)
             return
         try:
-            image = read_image(path, as_shown=True)
+            image = read_image(path, bits=self.bits, as_shown=True)
         except FrameError as fault:
             if wanted is None and width * height > LARGE_PX:
                 raise FrameError(fault.what, where=path, fix="run it smaller with --size H W, or cut it up") from fault
@@ -221,15 +225,14 @@ class LabelWriter:
     def _label_large(self, path: Path, mask: Path | None, scores: SegmentationScores, size: Size, wanted: Size) -> None:
         """The same for a picture that is never held as more than one number a pixel; its overlay is smaller than it."""
         height, width = size
-        free = available_bytes()
         # Its labels, and as much again while they are compressed.
-        if free is not None and 2 * height * width > free:
+        if 2 * height * width > available_bytes():
             raise FrameError(
                 f"the labels of an image of {width}x{height} px take more memory than there is",
                 where=path,
                 fix="cut it into tiles",
             )
-        logits = self.segmenter.logits(read_decimated(path, wanted))
+        logits = self.segmenter.logits(read_decimated(path, wanted, self.bits))
         truth = None if mask is None else read_labels(mask, self.lookup)
         labels, counted = np.empty(size, np.uint8), scores.images
         with ExitStack() as stack:
@@ -246,7 +249,8 @@ class LabelWriter:
                     scores.images = counted + 1
         step = -(-max(size) // OVERVIEW_PX)
         small = labels[::step, ::step]
-        self._write(path, labels, overlay_labels(read_decimated(path, small.shape), small, self.segmenter.classes))
+        overview = read_decimated(path, small.shape, self.bits)
+        self._write(path, labels, overlay_labels(overview, small, self.segmenter.classes))
 
     def _write(self, path: Path, labels: np.ndarray, overlay: np.ndarray) -> None:
         for suffix, picture in (("", labels), ("_overlay", overlay)):

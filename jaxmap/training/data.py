@@ -25,6 +25,7 @@ from jaxmap.datasets.masks import (
     read_labels,
     unnamed_codes,
 )
+from jaxmap.datasets.options import Bits
 from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, stereo_paths
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import read_text
@@ -51,6 +52,7 @@ class Example(NamedTuple):
         mask: the mask file.
         size_px: (height, width) of the image as viewers show it, from its header.
         stereo: folder of `disparity/NAME.png` and `cameras/NAME.json`; None where there are none or none are wanted.
+        bits: how many a 16-bit image uses; found in it where None.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Example(NamedTuple):
     mask: Path
     size_px: tuple[int, int]
     stereo: Path | None = None
+    bits: Bits | None = None
 
 
 class TrainingSet(NamedTuple):
@@ -105,7 +108,7 @@ def open_training_set(
     def examples(names: Sequence[str]) -> tuple[Example, ...]:
         sizes = _in_threads(lambda name: image_size_px(images[name][0], as_shown=True), names)
         return tuple(
-            Example(name, images[name][0], masks[name][0], (height, width))
+            Example(name, images[name][0], masks[name][0], (height, width), bits=options.image_bits)
             for name, (width, height) in zip(names, sizes, strict=True)
         )
 
@@ -226,12 +229,13 @@ def digest(training_set: TrainingSet) -> str:
         for example in part:
             stereo = () if example.stereo is None else stereo_paths(example.stereo, example.name)
             sizes = (*example.size_px, *map(_file_size, (example.image, example.mask, *stereo)))
+            sizes += () if example.bits is None else (example.bits,)
             text.update(os.fsencode(f"{example.name}\0{sizes}\n"))
     return text.hexdigest()
 
 
 def _read_rgb(example: Example) -> Pixels:
-    image = read_image(example.image, as_shown=True)
+    image = read_image(example.image, bits=example.bits, as_shown=True)
     if image.shape[:2] != example.size_px:
         raise JaxmapError(
             f"the image is {image.shape[1]}x{image.shape[0]} px, and was {example.size_px[1]}x{example.size_px[0]} px",

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Interval
 from pydantic import BeforeValidator
 
+from jaxmap.datasets.options import Bits
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import NotNegative, Positive, Seed, count, options
 from jaxmap.models.architecture import Backbone
@@ -31,6 +32,8 @@ class DataOptions:
     value * every other."""
     palette: dict[str, str] | None = None
     """Colour of the masks by class, such as rock #ff0000; several of a class with blanks between."""
+    image_bits: Bits | None = None
+    """Bits that 16-bit images use: 8, 10, 12, 14 or 16; by default found in each image."""
     validation_share: Share = 0.2
     """Share of the images that validates where no val.txt or train.txt says."""
 

@@ -78,6 +78,22 @@ def test_times_are_paired_by_the_nearest(offset_ns, lost, prefix):
     assert paired(names, theirs) == expected
 
 
+@pytest.mark.parametrize("pattern", ["img_{}.{:09d}", "{}_{:09d}", "left-{}-{:09d}", "cam0_{}.{:09d}", "Frame{}{:09d}"])
+def test_times_stand_behind_words_and_in_seconds_and_nanoseconds(pattern):
+    left = [pattern.format(1_700_000_000, index * 10**8) for index in range(3)]
+    right = [f"1700000000.{index * 10**8 + 31_000:09d}" for index in range(3)]
+    if pattern.startswith("Frame"):
+        right = [name.replace(".", "") for name in right]
+    assert paired(left, right) == right
+    keys = pair_files(files("left", left), files("right", right)).keys
+    assert [float(key.replace(".", "")) for key in keys] == [1.7e18 + index * 10**8 for index in range(3)]
+
+
+@pytest.mark.parametrize("name", ["frame_000123", "frame0.5x", "LocCam_2015_11_26_15_36_29_29", "a-1-2"])
+def test_counters_and_dates_stay_names(name):
+    assert pair_files(files("left", [name]), files("right", [name])).keys == (name,)
+
+
 def test_what_pairing_by_time_did_is_told():
     left = [f"{1700000000 + index / 10:.6f}" for index in range(4)]
     right = [f"{1700000000 + index / 10 + 0.012:.6f}" for index in (0, 1, 3, 4)]

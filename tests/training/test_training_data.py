@@ -267,6 +267,15 @@ def test_a_mask_on_the_stored_pixels_of_a_turned_photograph_is_refused(folder) -
     )
 
 
+def test_the_bits_of_deep_images_can_be_given(folder) -> None:
+    deep = np.linspace(0, 1023, 240).astype(np.uint16).reshape(12, 20)
+    (folder / "images/a.jpg").unlink()
+    write_mask(folder / "images/a.png", deep)
+    for bits, shift in ((None, 2), (12, 4)):
+        opened = open_training_set(folder, CLASSES, DataOptions(validation_share=0, image_bits=bits))
+        np.testing.assert_array_equal(read_example(opened.train[0], opened.lookup)[0][..., 1], deep >> shift)
+
+
 @pytest.mark.parametrize("suffix", ["PNG", "tif", "bmp"])
 def test_masks_may_have_other_suffixes(folder, suffix) -> None:
     with Image.open(folder / "masks/a.png") as mask:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fixtures import cli, shared_cache  # noqa: F401
+from PIL import Image
 from tiny_training import ARCHITECTURE, network_is_tiny, train_words, write_data_and_config  # noqa: F401
 from training_data import CLASSES
 
@@ -96,6 +97,18 @@ def test_faults_of_disparities_are_found_before_training(copy):
         check_training_set(opened(copy))
     (copy / "disparity" / f"{NAME}.png").unlink()
     with pytest.raises(JaxmapError, match="no training image has a disparity"):
+        opened(copy)
+
+
+def test_a_disparity_of_an_image_with_a_rotation_tag_is_refused(copy):
+    """The image would be turned, the disparity not."""
+    path = copy / "images" / f"{NAME}.png"
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    with Image.open(path) as image:
+        image.load()
+        image.save(path, exif=exif)
+    with pytest.raises(JaxmapError, match=r"the image has a disparity and a rotation tag in .*i0.png; remove the tag"):
         opened(copy)
 
 

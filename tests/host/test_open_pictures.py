@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 import jaxmap
-from jaxmap.errors import FrameError
-from jaxmap.host.pictures import open_picture
+from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.host.pictures import check_encoded, open_picture
+from jaxmap.report.page import inline_image
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (6, 9, 3), np.uint8)
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n"
@@ -58,11 +59,26 @@ def test_no_other_format_is_opened_whatever_its_name(tmp_path, content, monkeypa
     assert refused(path) == f"not an image of a known format in {path}; give PNG, JPEG, TIFF, BMP, PGM, PPM or WebP"
 
 
+def test_a_report_opens_no_other_format_either(tmp_path):
+    (tmp_path / "bev.png").write_bytes(EPS)
+    with pytest.raises(JaxmapError, match=r"not a readable picture in .*bev\.png; remove it or map again"):
+        inline_image(tmp_path / "bev.png", "map")
+
+
 def test_a_large_size_is_refused_by_the_header(tmp_path):
     path = huge_png(tmp_path / "bomb.png", 60_000, 60_000)
     assert "the mask is 60000x60000 px, more than the 134 million" in refused(path, noun="mask")
     path = huge_png(tmp_path / "bomb.png", 300, 200)
     assert "the image is 300x200 px, more" in refused(path, max_px=50_000)
+
+
+def test_encoded_pictures_are_bounded_too(tmp_path):
+    data = huge_png(tmp_path / "bomb.png", 60_000, 60_000).read_bytes()
+    with pytest.raises(FrameError, match=r"the image is 60000x60000 px, more than the 134 million .* in /camera at 12"):
+        check_encoded(data, "/camera at 12")
+    with pytest.raises(FrameError, match="the image cannot be read"):
+        check_encoded(data[:20], "/camera at 12")
+    check_encoded(huge_png(tmp_path / "small.png", 9, 6).read_bytes(), "/camera at 12")
 
 
 def test_only_regular_files_are_read(tmp_path):
@@ -76,4 +92,5 @@ def test_the_package_opens_pictures_nowhere_else():
     package = Path(jaxmap.__file__).parent
     opening = re.compile(r"\bImage\.open\(|\bimread\w*\(|\bimdecode\w*\(")
     found = {path.relative_to(package).as_posix() for path in package.rglob("*.py") if opening.search(path.read_text())}
-    assert found <= {"datasets/images.py"}  # decodes what `open_picture` opened
+    # These decode what was opened or checked here.
+    assert found <= {"datasets/images.py", "datasets/bag_images.py"}
