@@ -65,7 +65,7 @@ class RefineArguments:
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     calibration: Path | None = None
-    """Camera file in place of the sequence's own."""
+    """Camera file in place of the sequence's own: jaxmap's YAML, or one of OpenCV, ROS, Kalibr or MATLAB."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
     crs: str | None = None

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.images import list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, read_timestamps
@@ -30,7 +30,7 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
 
     Images are `left/NAME` and `right/NAME`, of the same names, in the natural order of the names
     (`f2` before `f10`). The calibration is `camera.yaml` (`calibration.read_camera_yaml` describes
-    it) or the one given; the poses are `poses.tum` or those given.
+    it) or the one given, of any kind; the poses are `poses.tum` or those given.
 
     The times of the frames come from the first source that exists:
 
@@ -48,11 +48,11 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
     """
     images = list_images(folder / "left")
     calibration = options.calibration or folder / "camera.yaml"
-    if not calibration.is_file():
+    if not calibration.exists():
         raise JaxmapError(
             f"no calibration: there is no file {calibration}", fix="write camera.yaml, or give --calibration FILE"
         )
-    camera = read_camera_yaml(calibration)
+    camera, camera_notes = read_calibration(calibration, images)
     track = read_pose_track(options, folder / "poses.tum")
     images, times_s, note = _timed_images(folder, images, track)
     frames = [
@@ -67,7 +67,7 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
         track=track,
         camera=camera,
         options=options,
-        notes=[note],
+        notes=[note, *camera_notes],
     )
 
 

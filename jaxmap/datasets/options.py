@@ -58,7 +58,7 @@ class ReadOptions:
     poses_world: PosesWorld = "auto"
     """World of the poses: z up, camera-like (y down), or find out."""
     calibration: Path | None = None
-    """Camera file in place of the sequence's own."""
+    """Camera file in place of the sequence's own: jaxmap's YAML, or one of OpenCV, ROS, Kalibr or MATLAB."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
     antenna_m: tuple[Offset, Offset, Offset] | None = None
