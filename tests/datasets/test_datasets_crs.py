@@ -75,7 +75,12 @@ FEET = np.array([[985000.0, 195000.0, 30.0], [985020.0, 195010.0, 30.0]])
         ("EPSG:2263", LOCAL, "is in units of a US survey foot", "--crs EPSG:32618"),
         ("EPSG:3857", np.array([[489_000.0, 6_841_000.0, 3.0]]), "metres that are 1.63 times too long", "EPSG:32631"),
         ("EPSG:4326+5773", LOCAL, "is in units of a degree", "EPSG:326ZZ"),
-        ("+proj=longlat +a=3396190 +b=3376200 +no_defs", LOCAL, "is in units of a degree", "projected system of that body"),
+        (
+            "+proj=longlat +a=3396190 +b=3376200 +no_defs",
+            LOCAL,
+            "is in units of a degree",
+            "projected system of that body",
+        ),
         ("+proj=utm +zone=31 +units=us-ft", LOCAL, "is in units of a US survey foot", "EPSG:326"),
     ],
 )

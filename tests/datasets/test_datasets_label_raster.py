@@ -272,11 +272,15 @@ def test_one_rock_alone_and_lists_of_another_system(tmp_path):
     [
         ("", "no rocks"),
         ("x,y\n", "no rocks"),
-        ("1 2\n3\n", "1 columns in .*line 2"),
+        ("1 2\n3\n", "1 columns, and 2 in the first line .*line 2"),
         ("1 2 3\n1 b 3\n", "line 2"),
         ("1 nan\n", "not finite"),
         ("1 2 -3\n", "not positive"),
-        ("east,north\n1,2\n", "the columns are east north"),
+        ("rock,place\n1,2\n", "the columns are rock place"),
+        ("id;x;y;d\n1,0,1,4,3\n", "5 columns, and 1 names"),
+        ("1,0,1,4,3,0,8\n", "7 columns without a header"),
+        ("x;y;d\n0,1;4,3;0.8\n", "decimal points and decimal commas"),
+        ("x y d [furlong]\n1 2 3\n", "d in the unit 'furlong'"),
         ("1 2\n", "do not lie over the map: they reach from"),
     ],
 )
