@@ -302,6 +302,8 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         JaxmapError: the data or the settings do not serve.
     """
     sequence = open_sequence(source, config)
+    if config.strict and sequence.pose_faults:
+        raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
     front_end = StereoFrontEnd(sequence.camera, config.stereo)
     camera = front_end.camera
     _describe_sequence(sequence, camera, notify)

@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence, rosbag
 from jaxmap.datasets.bag_files import Bag
-from jaxmap.datasets.bag_frames import T_LINK_OPTICAL, make_track
+from jaxmap.datasets.bag_frames import T_LINK_OPTICAL
 from jaxmap.datasets.bag_images import decode_image
 from jaxmap.datasets.bag_log import read_log
 from jaxmap.datasets.crs import to_utm
 from jaxmap.datasets.options import BagOptions
+from jaxmap.datasets.stamped_poses import make_track
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
@@ -200,6 +201,19 @@ def test_poses_of_the_body_come_to_the_camera_by_tf(tmp_path, kind):
     sequence = open_sequence(bag(bare, kind, images(messages) + odometry))
     np.testing.assert_allclose(sequence.T_world_camera[:, :3, :3], truth[:, :3, :3], atol=1e-9)
     assert "tf does not say where the camera is" in " ".join(sequence.notes)
+
+
+def test_conventions_that_are_asked_for_are_those_of_the_messages(tmp_path):
+    messages = Messages("ros1")
+    truth = np.stack([scenes.pose(index) for index in range(FRAMES)])
+    sent = images(messages)
+    for index, T in enumerate(truth @ T_LINK_OPTICAL.T):
+        T[:3, 3] *= 1000
+        sent.append(Sent("/odom", time_ns(index), messages.odometry(time_ns(index), T, "cam_optical")))
+    options = ReadOptions(pose_convention="body", poses_unit="mm")
+    sequence = open_sequence(bag(tmp_path, "ros1", sent), options)
+    np.testing.assert_allclose(sequence.T_world_camera, truth, atol=1e-9)
+    assert "body axes at the camera's place, as asked" in sequence.notes
 
 
 def test_a_camera_that_turns_on_the_body_is_followed(tmp_path):
