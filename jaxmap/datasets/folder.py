@@ -43,7 +43,8 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
 
     Images are `left/NAME` and `right/NAME`, in the natural order of the names (`f2` before `f10`). The folders may be
     others of `SIDES`, and where names differ, `pair_files` says what makes a pair. The calibration is `camera.yaml`
-    (`calibration.read_camera_yaml` describes it) or the one given, of any kind; the poses are `poses.tum` or those given.
+    (`calibration.read_camera_yaml` describes it) or the one given, of any kind; the poses are `poses.tum` or those
+    given.
 
     The times of the frames come from the first source that exists:
 

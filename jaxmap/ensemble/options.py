@@ -13,7 +13,7 @@ Sigma = Annotated[float, NotNegative]
 class EnsembleOptions:
     """Members and their spread. A standard deviation of 0 turns its error off."""
 
-    members: Annotated[int, count(1024, least=0)] = 0
+    members: Annotated[int, count(256, least=0)] = 0
     """Maps beside the map, each made with errors of its own; 0 makes none. Each takes as much memory as the occupancy
     and one class of the map."""
     position_sigma_m: Sigma = 0.02
@@ -35,5 +35,5 @@ class EnsembleOptions:
     """Relative standard deviation (log-normal) of the temperature of soft labels."""
     label_bias_sigma: Sigma = 1.0
     """Standard deviation of what is added to the logits of each class of soft labels, the same for the whole drive."""
-    at_once: Annotated[int, count(1024)] = 1
+    at_once: Annotated[int, count(256)] = 1
     """Members computed together: faster on an accelerator, at the cost of memory. The result is the same."""

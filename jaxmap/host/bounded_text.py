@@ -35,7 +35,7 @@ class Bounds(NamedTuple):
     aliases: int = 0
 
 
-YAML_BOUNDS = Bounds(text_bytes=2 << 20, depth=32, nodes=50_000, aliases=100)
+YAML_BOUNDS = Bounds(text_bytes=2 << 20, depth=32, nodes=30_000, aliases=100)
 JSON_BOUNDS = Bounds(text_bytes=64 << 20, depth=32, nodes=2_000_000)
 
 

@@ -38,6 +38,11 @@ def bundled(name: str) -> Path:
     return path
 
 
+def real_path(path: str | os.PathLike[str]) -> Path:
+    """The path without links; of a link to itself, which `Path.resolve` raises at, as far as it leads."""
+    return Path(os.path.realpath(path))
+
+
 def check_regular(path: Path, most_bytes: int) -> None:
     """Refuses what is no regular file before it is opened: a pipe would wait for ever, a device may never end.
 

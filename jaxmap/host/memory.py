@@ -6,6 +6,7 @@ import os
 import platform
 import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 _TUNABLES = "GLIBC_TUNABLES"
@@ -52,14 +53,19 @@ def peak_resident_mib() -> float:
 
 
 def available_bytes() -> int | None:
-    """The memory that a program may still take, or None where the system does not say."""
-    status = Path("/proc/meminfo")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            name, _, value = line.partition(":")
-            if name == "MemAvailable":
-                return int(value.split()[0]) * 2**10
-    return None
+    """The memory that a program may still take, or None where the system does not say.
+
+    It is what the system has left, or what a container or a limit of the process allows where that is less.
+    """
+    limits = []
+    with suppress(OSError, ValueError, IndexError):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        limits += [int(line.split()[1]) * 2**10 for line in lines if line.startswith("MemAvailable:")]
+    with suppress(OSError, ValueError):
+        limits.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    if (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
+        limits.append(limit)
+    return min(limits, default=None)
 
 
 def _is_supported() -> bool:

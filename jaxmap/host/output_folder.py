@@ -12,7 +12,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.host.files import atomic_path, write_error
+from jaxmap.host.files import atomic_path, real_path, write_error
 
 
 @contextmanager
@@ -60,9 +60,9 @@ def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) ->
     Raises:
         UsageError: an output has the path of an input.
     """
-    read = {path.resolve() for path in inputs if path is not None}
+    read = {real_path(path) for path in inputs if path is not None}
     for path in outputs:
-        if path.resolve() in read:
+        if real_path(path) in read:
             raise UsageError("an input would be overwritten", where=path, fix="choose another --out")
 
 

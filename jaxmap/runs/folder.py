@@ -23,7 +23,7 @@ from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
 from jaxmap.host.bounded_text import read_text
-from jaxmap.host.files import atomic_path
+from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.host.replacement import Replacement
 from jaxmap.mapping.store import MapAttributes, holds_map, load_map, stray_maps
@@ -132,9 +132,9 @@ class RunFolder:
         Raises:
             UsageError: the folder is the sequence's own, or an output would overwrite an input.
         """
-        here = self.path.resolve()
-        folders = {folder.resolve() for folder in {image.parent for image in images}}
-        if here == Path(source).resolve() or not folders.isdisjoint((here, *here.parents)):
+        here = real_path(self.path)
+        folders = {real_path(folder) for folder in {image.parent for image in images}}
+        if here == real_path(source) or not folders.isdisjoint((here, *here.parents)):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
         check_inputs_stay(self._files, inputs)
 

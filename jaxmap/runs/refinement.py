@@ -22,6 +22,7 @@ from jaxmap.datasets.rasters import read_heights
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.host.bounded_text import read_json
+from jaxmap.host.files import real_path
 from jaxmap.host.output_folder import check_inputs_stay, locked, write_json
 from jaxmap.host.prefetch import prefetch
 from jaxmap.host.replacement import Replacement
@@ -141,7 +142,7 @@ def check_inputs_apart(source: str, out: Path, inputs: Iterable[Path | None]) ->
     Raises:
         UsageError: the folder is the sequence's own, or an output would overwrite an input.
     """
-    if out.resolve() == Path(source).resolve():
+    if real_path(out) == real_path(source):
         raise UsageError("the folder is the sequence's own", where=out, fix="choose another --out")
     check_inputs_stay((out / name for name in (*OUTPUTS, CALIBRATION)), inputs)
 

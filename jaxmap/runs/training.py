@@ -17,7 +17,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import read_text
-from jaxmap.host.files import atomic_path
+from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, write_json, write_yaml
 from jaxmap.host.replacement import Replacement
 from jaxmap.models.checkpoint import save_model
@@ -145,7 +145,7 @@ class TrainingFolder:
         self._replacement.settle()
         tree = {
             "training_data": plan.data.source,
-            "init": None if plan.init is None else str(plan.init.resolve()),
+            "init": None if plan.init is None else str(real_path(plan.init)),
             **TRAIN_SETTINGS.tree(plan.config),
         }
         there = [path.name for path in self._outputs() if path.exists()]
@@ -192,7 +192,7 @@ class TrainingFolder:
         writer.writeheader()
         writer.writerows(log.history)
         with atomic_path(self.history) as temporary:
-            temporary.write_text(text.getvalue(), encoding="utf8")
+            temporary.write_text(text.getvalue(), encoding="utf8", errors="backslashreplace")
 
     def write_report(
         self, plan: TrainingPlan, log: TrainingLog, examples: Sequence[ValidationExample], status: str
@@ -225,7 +225,7 @@ class TrainingFolder:
             )
         )
         with atomic_path(self.report) as temporary:
-            temporary.write_text(page, encoding="utf8")
+            temporary.write_text(page, encoding="utf8", errors="backslashreplace")
         write_json(self.metrics, log.metrics(plan))
 
 

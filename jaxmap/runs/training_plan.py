@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxmap.errors import UsageError
 from jaxmap.geometry.options import GridOptions
+from jaxmap.host.files import real_path
 from jaxmap.host.settings import CellSize, NotNegative, Positive, Settings, options
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import load_model
@@ -159,12 +160,12 @@ class ImageTrainingData:
     @property
     def source(self) -> str:
         """The folder."""
-        return str(self.training_set.folder.resolve())
+        return str(real_path(self.training_set.folder))
 
     @property
     def title(self) -> str:
         """The folder's name."""
-        return self.training_set.folder.resolve().name
+        return real_path(self.training_set.folder).name
 
     @property
     def names(self) -> tuple[str, ...]:

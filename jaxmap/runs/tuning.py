@@ -282,7 +282,7 @@ class TuningRun:
         }
         write_json(self._out.with_suffix(".json"), result)
         with atomic_path(self._out.with_suffix(".html")) as temporary:
-            temporary.write_text(tuning_page(self._out.stem, result), encoding="utf-8")
+            temporary.write_text(tuning_page(self._out.stem, result), encoding="utf-8", errors="backslashreplace")
         return result
 
     def _stage(self, name: str, before: TunedParams, start: TunedParams, advance: Callable[[int, str], None]) -> _Stage:

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import jaxmap
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import read_json
 from jaxmap.host.cache import cache_folder
 from jaxmap.host.files import atomic_path
 
@@ -97,9 +98,9 @@ def fault_of(path: str) -> str | None:
     """Why a library does not work, None where it does; from the cache where it was tried before."""
     file = None
     # Without a cache folder, or with a damaged file, the library is tried again.
-    with suppress(OSError, ImportError, RuntimeError, ValueError, KeyError, TypeError):
+    with suppress(JaxmapError, OSError, ImportError, RuntimeError, ValueError, KeyError, TypeError):
         file = cache_folder() / "llvm" / f"{_trial_key(path)}.json"
-        return json.loads(file.read_bytes())["fault"]
+        return read_json(file)["fault"]
     fault, lasting = _try_out(path)
     if file is not None and lasting:
         with suppress(JaxmapError, OSError), atomic_path(file) as temporary:

@@ -81,6 +81,33 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, fini
 
 
 @pytest.mark.slow
+def test_an_interrupt_right_after_a_frame_loses_no_picture(cli, scene_folder, finished_run, tmp_path):
+    run = tmp_path / "run"
+
+    def interrupt(fused: FusedFrame) -> None:
+        if fused.prepared.index == 2:
+            raise KeyboardInterrupt
+
+    folder = RunFolder(run)
+    folder.begin(planned(scene_folder).settings(config_of()), resume=False, overwrite=False)
+    with pytest.raises(KeyboardInterrupt):
+        run_plan(
+            planned(scene_folder),
+            folder,
+            strict=False,
+            checkpoint_every_s=60.0,
+            notify=lambda line: None,
+            on_frame=interrupt,
+        )
+    assert load_map(run / "map.zarr")[1].progress["next_index"] == 3
+    assert cli(*map_words(scene_folder, run, "--resume")).status == 0
+    pictures = [
+        {file.name: file.read_bytes() for file in (folder / "pictures").iterdir()} for folder in (run, finished_run)
+    ]
+    assert pictures[0] == pictures[1] and len(pictures[0]) >= 9
+
+
+@pytest.mark.slow
 def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
     run_until(scene_folder, tmp_path / "run", 2)
     folder = RunFolder(tmp_path / "run")
