@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import read_json
 from jaxmap.models.file_kinds import kind_of_weights
 from jaxmap.models.torch_files import Choose, Tensors, all_of, from_bfloat16, read_torch_file
 
@@ -16,7 +16,6 @@ _FLOATS = {"F16": np.float16, "F32": np.float32, "F64": np.float64}
 _BFLOAT16 = "BF16"
 _TORCH_SUFFIXES = (".pth", ".pt", ".bin", ".ckpt", ".tar")
 _INDEX = ".index.json"
-_MAX_INDEX_BYTES = 2**25
 
 
 def read_tensors(path: Path, choose: Choose = all_of) -> Tensors:
@@ -67,18 +66,13 @@ def _shards(index: Path) -> list[Path]:
     Raises:
         JaxmapError: it is no index, or shards are missing.
     """
-    try:
-        if index.stat().st_size > _MAX_INDEX_BYTES:
-            raise ValueError("it is too large")
-        places = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
-        names = sorted({str(name) for name in places.values()})
-        if not names or any(Path(name).name != name for name in names):
-            raise ValueError("weight_map does not name files beside it")
-    except FileNotFoundError as fault:
-        raise JaxmapError("no such file", where=index, fix="check the path") from fault
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as fault:
-        reason = f"{type(fault).__name__}: {' '.join(str(fault).split())[:100]}"
-        raise JaxmapError(f"no index of shards ({reason})", where=index, fix="download it again") from fault
+    content = read_json(index)
+    places = content.get("weight_map") if isinstance(content, dict) else None
+    names = sorted({str(name) for name in places.values()}) if isinstance(places, dict) else []
+    if not names or any(Path(name).name != name for name in names):
+        raise JaxmapError(
+            "no index of shards: weight_map names no files beside it", where=index, fix="restore the file"
+        )
     missing = [name for name in names if not (index.parent / name).is_file()]
     if missing:
         raise JaxmapError(

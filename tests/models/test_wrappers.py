@@ -142,5 +142,5 @@ def test_shards_and_bfloat16_in_safetensors(state, plain, tmp_path):
 def test_a_damaged_index_is_one_line(text, tmp_path):
     index = tmp_path / "model.safetensors.index.json"
     index.write_text(text)
-    with pytest.raises(JaxmapError, match="no index of shards"):
+    with pytest.raises(JaxmapError, match="no index of shards|not readable as JSON"):
         import_weights(index)
