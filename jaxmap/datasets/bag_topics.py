@@ -148,7 +148,7 @@ def choose_poses(topics: Mapping[str, Topic], options: BagOptions, where: Path) 
         raise JaxmapError(
             f"the bag has no poses: no Odometry, pose, Path, tf or NavSatFix topic among {_listed(topics)}",
             where=where,
-            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera)",
+            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera), or --poses odometry",
         )
     return chosen[0]
 

@@ -81,6 +81,8 @@ class StereoSequence:
         pose_faults: those of the notes that tell of poses that were left out as unusable.
         pose_reading: the conventions that the poses were read by.
         read_pair: reads the images of one frame.
+        rectify_labels: where `read_pair` rectifies: the same for labels (H, W) or probabilities (H, W, C) of the left
+            image of a frame as it lies on disk; else None.
         true_disparity: reads the true disparity of a frame's left image in px, NaN where unknown; None where the
             sequence has no truth, and for a frame without one.
     """
@@ -95,6 +97,7 @@ class StereoSequence:
     site_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    rectify_labels: Callable[[FrameRef, np.ndarray], np.ndarray] | None = None
     true_disparity: Callable[[FrameRef], np.ndarray | None] | None = None
     pose_faults: tuple[str, ...] = ()
     pose_reading: PoseReading = field(default_factory=PoseReading)

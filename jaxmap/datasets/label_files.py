@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -27,12 +28,14 @@ class LabelFolder:
         soft: whether they are probabilities.
         class_count: the number of classes.
         labels_are: whether they label the raw or the rectified pixels of the left image.
+        rectify: the sequence's `rectify_labels`, for raw ones; the front end rectifies them where it is None.
     """
 
     folder: Path
     soft: bool
     class_count: int
     labels_are: Literal["raw", "rectified"]
+    rectify: Callable[[FrameRef, np.ndarray], np.ndarray] | None = None
 
     def read(self, ref: FrameRef, front_end: StereoFrontEnd) -> dict[str, np.ndarray]:
         """The labels of one frame on its rectified pixels, as the fields of `Frame` that they fill.
@@ -45,7 +48,7 @@ class LabelFolder:
         labels = self._read_probabilities(path, *expected) if self.soft else self._read_indices(ref.name)
         _check_size(labels.shape, expected, path)
         if self.labels_are == "raw":
-            labels = front_end.rectify_labels(labels)
+            labels = self.rectify(ref, labels) if self.rectify else front_end.rectify_labels(labels)
         return {"class_probabilities" if self.soft else "labels": labels}
 
     def _read_indices(self, name: str) -> np.ndarray:

@@ -67,7 +67,7 @@ class ReadOptions:
     """
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder, katwijk, rosbag, madmax, tartanair or middlebury."""
+    """The reader: auto, kitti, euroc, folder, katwijk, planetary, asp, rosbag, madmax, tartanair or middlebury."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: PosesWorld = "auto"
@@ -90,7 +90,7 @@ class ReadOptions:
     """Camera file in place of the sequence's own: jaxmap's YAML, or one of OpenCV, ROS, Kalibr or MATLAB."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam; KITTI: grey (the default)
-    or color."""
+    or color; planetary archives: navcam, front_hazcam, rear_hazcam, pancam, mastcam, mastcam_z or other."""
     image_bits: Bits | None = None
     """Bits that 16-bit images use: 8, 10, 12, 14 or 16; by default found from several images of both cameras."""
     antenna_m: tuple[Offset, Offset, Offset] | None = None

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmap.datasets import euroc, folder, katwijk, kitti, madmax, middlebury, rosbag, tartanair
+from jaxmap.datasets import (
+    asp,
+    euroc,
+    folder,
+    katwijk,
+    kitti,
+    madmax,
+    middlebury,
+    planetary,
+    rosbag,
+    tartanair,
+)
 from jaxmap.datasets.base import Reader, StereoSequence
 from jaxmap.datasets.crs import check_crs, check_metres
 from jaxmap.datasets.options import ReadOptions
@@ -20,6 +31,8 @@ READERS: dict[str, Reader] = {
         euroc,
         folder,
         katwijk,
+        planetary,
+        asp,
         rosbag,
         madmax,
         tartanair,
