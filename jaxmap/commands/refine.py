@@ -88,7 +88,7 @@ class RefineArguments:
     baseline_unit: LengthUnit = "m"
     """Unit in which the calibration gives the stereo baseline."""
     calibration: Path | None = None
-    """Camera file in place of the sequence's own."""
+    """Camera file in place of the sequence's own: jaxmap's YAML, or one of OpenCV, ROS, Kalibr or MATLAB."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
     bag: BagOptions = field(default_factory=BagOptions)

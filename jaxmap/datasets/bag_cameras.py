@@ -12,7 +12,8 @@ from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
 from jaxmap.types import StereoCamera
 
-_COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "": (0,)}
+_FISHEYE = ("equidistant", "fisheye")
+_COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "": (0,), **dict.fromkeys(_FISHEYE, (4,))}
 
 
 class CameraInfo:
@@ -89,8 +90,16 @@ def raw_rig(left: CameraInfo, right: CameraInfo, T_left_right: Float64[np.ndarra
             raise JaxmapError(
                 f"distortion {info.model[:40]!r} with {len(info.D)} coefficients",
                 where=info.topic,
-                fix="plumb_bob and rational_polynomial are read; rectify the images, or give --calibration FILE",
+                fix="plumb_bob, rational_polynomial and equidistant are read; rectify, or give --calibration FILE",
             )
+    fisheye = [info.model in _FISHEYE for info in (left, right)]
+    if fisheye[0] != fisheye[1]:
+        raise JaxmapError(
+            f"one camera is {left.model}, the other {right.model}",
+            where=f"{left.topic} and {right.topic}",
+            fix="rectify the images, or calibrate both alike",
+        )
+    no_distortion = np.zeros(4 if fisheye[0] else 5)
     f_left, f_right = left.P[0, 0], right.P[0, 0]
     baseline_m = left.P[0, 3] / f_left - right.P[0, 3] / f_right if f_left > 0 and f_right > 0 else 0.0
     if baseline_m:
@@ -107,11 +116,12 @@ def raw_rig(left: CameraInfo, right: CameraInfo, T_left_right: Float64[np.ndarra
         )
     return make_stereo_rig(
         K_left=left.K,
-        distortion_left=left.D if left.D.size else np.zeros(5),
+        distortion_left=left.D if left.D.size else no_distortion,
         K_right=right.K,
-        distortion_right=right.D if right.D.size else np.zeros(5),
+        distortion_right=right.D if right.D.size else no_distortion,
         R_right_left=R_right_left,
         t_right_left_m=t_right_left_m,
         size_px=left.size_px,
+        model="equidistant" if fisheye[0] else "opencv",
         where=f"{left.topic} and {right.topic}",
     )

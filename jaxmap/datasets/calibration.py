@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import yaml
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from jaxmap.datasets.matlab import is_matlab
 from jaxmap.datasets.text_files import image_size, load_yaml, number, number_list
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
-from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
+from jaxmap.stereo.rectify import DistortionModel, StereoRig, make_stereo_rig
 from jaxmap.types import StereoCamera, make_stereo_camera
 
 _RECTIFIED_KEYS = ("image_size_px", "fx_px", "cx_px", "cy_px", "baseline_m")
 _RECTIFIED_OPTIONAL = ("fy_px", "doffs_px", "mounting")
 _RAW_KEYS = ("image_size_px", "left", "right", "R_right_left", "t_right_left_m")
-_RAW_OPTIONAL = ("doffs_px", "mounting")
+_RAW_OPTIONAL = ("doffs_px", "distortion_model", "mounting")
 _RAW_CAMERA_KEYS = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
 
 
@@ -44,6 +46,7 @@ def read_camera_yaml(path: Path) -> StereoCamera | StereoRig:
         R_right_left: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
         t_right_left_m: [-0.11, 0, 0]
         doffs_px: 0.1                  # optional, added to the disparity offset of the rectified pair
+        distortion_model: equidistant  # optional: fisheye cameras, distortion k1 k2 k3 k4 of cv2.fisheye
 
     Both may hold `mounting`, see `read_mounting`.
 
@@ -61,8 +64,18 @@ def read_camera_yaml(path: Path) -> StereoCamera | StereoRig:
     return make_stereo_camera(**numbers, width_px=width_px, height_px=height_px, where=path)
 
 
+_OWN_KEYS = ("fx_px", "baseline_m", "image_size_px", "R_right_left", "t_right_left_m")
+
+
+def is_own(content: Mapping) -> bool:
+    """Whether the keys of a file are some of those that `read_camera_yaml` reads."""
+    return any(key in content for key in _OWN_KEYS)
+
+
 def read_mounting(path: Path) -> Float64[np.ndarray, "4 4"]:
     """T_nominal_camera: where the left camera really sits in the nominal camera's frame; identity without `mounting`.
+
+    Only jaxmap's own files hold one.
 
     It corrects poses that were derived for the nominal camera: `T_world_camera = T_world_nominal @ T_nominal_camera`::
 
@@ -74,6 +87,8 @@ def read_mounting(path: Path) -> Float64[np.ndarray, "4 4"]:
         JaxmapError: the file is malformed, or the mounting is not those two lists of three numbers.
     """
     T = np.eye(4)
+    if not path.is_file() or path.suffix.lower() == ".xml" or is_matlab(path):
+        return T
     mounting = load_yaml(path).get("mounting")
     if mounting is None:
         return T
@@ -114,6 +129,8 @@ def write_camera_yaml(
         tree["R_right_left"] = camera.R_right_left.tolist()
         tree["t_right_left_m"] = camera.t_right_left_m.tolist()
         tree["doffs_px"] = float(camera.doffs_px)
+        if camera.model != "opencv":
+            tree["distortion_model"] = camera.model
     if T_nominal_camera is not None:
         turn = Rotation.from_matrix(T_nominal_camera[:3, :3]).as_rotvec()
         tree["mounting"] = {"translation_m": T_nominal_camera[:3, 3].tolist(), "rotation_vector_rad": turn.tolist()}
@@ -144,8 +161,18 @@ def _raw_rig(content: Mapping, path: Path) -> StereoRig:
         t_right_left_m=number_list(content["t_right_left_m"], "t_right_left_m", path, count=3),
         size_px=image_size(content["image_size_px"], "image_size_px", path),
         doffs_px=number(content.get("doffs_px", 0.0), "doffs_px", path),
+        model=_distortion_model(content, path),
         where=path,
     )
+
+
+def _distortion_model(content: Mapping, path: Path) -> DistortionModel:
+    model = content.get("distortion_model", "opencv")
+    if model not in get_args(DistortionModel):
+        raise JaxmapError(
+            f"distortion_model is {model!r:.40}", where=path, fix=f"give {' or '.join(get_args(DistortionModel))}"
+        )
+    return model
 
 
 def pinhole_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> np.ndarray:
@@ -164,5 +191,6 @@ def _check_keys(path: Path, sections: Sequence[tuple[str, Mapping, Sequence[str]
             f"calibration keys {' and '.join(faults)}",
             where=path,
             fix=f"a rectified pair has {' '.join(_RECTIFIED_KEYS)} [{' '.join(_RECTIFIED_OPTIONAL)}], "
-            f"a raw one {' '.join(_RAW_KEYS)} [{' '.join(_RAW_OPTIONAL)}]",
+            f"a raw one {' '.join(_RAW_KEYS)} [{' '.join(_RAW_OPTIONAL)}]; files of OpenCV, ROS, Kalibr and MATLAB are "
+            "read as they are",
         )

@@ -80,6 +80,101 @@ def check_crs(name: str) -> None:
         ) from error
 
 
+def check_metres(name: str, path_m: Float64[np.ndarray, "N 3"]) -> None:
+    """Refuses a system whose x and y are no metres: of degrees, of feet, or geocentric.
+
+    Args:
+        name: of the system that poses are said to be in.
+        path_m: positions as the poses give them, from which the UTM zone of the place is told where they can.
+
+    Raises:
+        UsageError: x and y are no metres; the error names the UTM zone, where the place is known.
+    """
+    system = read_crs(name, "--crs")
+    while system.is_bound and system.source_crs is not None:
+        system = system.source_crs
+    flat = system.sub_crs_list[0] if system.is_compound else system
+    factors = [axis.unit_conversion_factor for axis in flat.axis_info[:2]]
+    stretch = 1.0
+    if not (flat.is_geographic or flat.is_geocentric) and all(abs(factor - 1) < 1e-9 for factor in factors):
+        stretch = _stretch_at(flat, path_m)
+        if abs(stretch - 1) < _MOST_STRETCH:
+            return
+    unit = next((axis.unit_name for axis in flat.axis_info), "another unit")
+    kind = "geocentric, so that z is not up" if flat.is_geocentric else f"in units of a {unit}, and a map is in metres"
+    if stretch != 1:
+        kind = f"in metres that are {stretch:.2f} times too long there"
+    if flat.ellipsoid is None or abs(flat.ellipsoid.semi_major_metre / _EARTH_M - 1) > 0.01:
+        fix = "give the poses in a projected system of that body in metres, and name it with --crs"
+    elif (zone := _zone_of(flat, path_m)) is not None:
+        fix = f"transform the poses to the UTM zone of the place, {zone}, and give --crs {zone}"
+    else:
+        fix = (
+            "name the system that the poses are in: the UTM zone of the place, EPSG:326ZZ (south: EPSG:327ZZ) with "
+            "ZZ = floor((longitude + 180) / 6) + 1; or leave --crs out if they are local metres"
+        )
+    raise UsageError(f"{name[:60]} ({flat.name}) is {kind}", where="--crs", fix=fix)
+
+
+_EARTH_M = 6_378_137.0
+_LARGE_AREA_DEG = 15.0
+_MOST_STRETCH = 0.05
+"""Web Mercator stretches lengths by 1 / cos(latitude); polar systems by up to 3 % where they are used."""
+
+
+def _stretch_at(system: pyproj.CRS, path_m: Float64[np.ndarray, "N 3"]) -> float:
+    """How many times longer lengths are in a projected system than on the ground, at the first position.
+
+    1 where the position is not in the area that the system is for: then it is local, and says nothing of the place.
+    """
+    import pyproj
+    from pyproj.exceptions import ProjError
+
+    try:
+        projection = pyproj.Proj(system)
+        longitude, latitude = projection(*path_m[0, :2], inverse=True)
+        if not _is_inside(system, longitude, latitude):
+            return 1.0
+        factors = projection.get_factors(longitude, latitude)
+        stretch = float(np.sqrt(factors.meridional_scale * factors.parallel_scale))
+    except ProjError:
+        return 1.0
+    return stretch if np.isfinite(stretch) else 1.0
+
+
+def _is_inside(system: pyproj.CRS, longitude_deg: float, latitude_deg: float) -> bool:
+    area = system.area_of_use
+    return area is None or (area.west <= longitude_deg <= area.east and area.south <= latitude_deg <= area.north)
+
+
+def _zone_of(system: pyproj.CRS, path_m: Float64[np.ndarray, "N 3"]) -> str | None:
+    """The UTM zone of positions in a system, or of the middle of the area that the system is for; None if unknown."""
+    import pyproj
+
+    x, y, z = path_m[0]
+    area = system.area_of_use
+    # Local metres about zero would be degrees near the Gulf of Guinea.
+    spread = float(np.ptp(path_m[:, :2], axis=0).max())
+    if system.is_geographic:
+        known = spread < 0.1 and max(abs(x), abs(y)) > 1 and abs(x) <= 180 and abs(y) <= 90
+    elif system.is_geocentric:
+        known = abs(np.linalg.norm(path_m[0]) / _EARTH_M - 1) < 0.02
+    else:
+        known = max(abs(x), abs(y)) > 1e4
+    if known:
+        to_degrees = pyproj.Transformer.from_crs(
+            system, "EPSG:4979" if system.is_geocentric else "EPSG:4326", always_xy=True
+        )
+        longitude, latitude, *_ = to_degrees.transform(x, y, z)
+        if np.isfinite([longitude, latitude]).all() and (
+            system.is_geocentric or _is_inside(system, longitude, latitude)
+        ):
+            return utm_crs(longitude, latitude)
+    if area is not None and 0 <= area.east - area.west < _LARGE_AREA_DEG:
+        return utm_crs((area.west + area.east) / 2, (area.south + area.north) / 2)
+    return None
+
+
 def crs_text(name: str | None) -> str:
     """A short name of a system: `EPSG:32631` where it has one."""
     if name is None:

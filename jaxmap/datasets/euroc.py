@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import pinhole_matrix, read_camera_yaml
+from jaxmap.datasets.calibration import pinhole_matrix
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.pairing import nearest_pairs
 from jaxmap.datasets.poses import parse_ns
@@ -37,7 +38,8 @@ def open_euroc(folder: Path, options: ReadOptions) -> StereoSequence:
     """
     mav0 = folder / "mav0"
     frames, dropped = _paired_frames(mav0)
-    camera = read_camera_yaml(options.calibration) if options.calibration else read_rig(folder)
+    given = options.calibration and read_calibration(options.calibration, [frame.left for frame in frames])
+    camera, camera_notes = given or (read_rig(folder), ())
     track = read_pose_track(options, mav0 / "state_groundtruth_estimate0" / "data.csv", allow_body=True)
     return assemble(
         name=Path(os.path.abspath(folder)).name,
@@ -48,7 +50,7 @@ def open_euroc(folder: Path, options: ReadOptions) -> StereoSequence:
         camera=camera,
         options=options,
         T_child_camera=_sensor(mav0 / "cam0" / "sensor.yaml")[0] if track.child == "body" else None,
-        notes=[f"{dropped} images have no partner within 5 ms and are left out"] * bool(dropped),
+        notes=[*[f"{dropped} images have no partner within 5 ms and are left out"] * bool(dropped), *camera_notes],
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.images import list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.pair_files import is_number, is_time, pair_files, units_per_second
@@ -50,7 +50,8 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
 
     Images are `left/NAME` and `right/NAME`, in the natural order of the names (`f2` before `f10`). The folders may be
     others of `SIDES`, and where names differ, `pair_files` says what makes a pair. The calibration is `camera.yaml`
-    (`calibration.read_camera_yaml` describes it) or the one given; the poses are `poses.tum` or those given.
+    (`calibration.read_camera_yaml` describes it) or the one given, of any kind; the poses are `poses.tum` or those
+    given.
 
     The times of the frames come from the first source that exists:
 
@@ -71,11 +72,11 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
     pairs = pair_files(images, _images(folder / right))
     partner, key = dict(zip(images, pairs.right, strict=True)), dict(zip(images, pairs.keys, strict=True))
     calibration = options.calibration or folder / "camera.yaml"
-    if not calibration.is_file():
+    if not calibration.exists():
         raise JaxmapError(
             f"no calibration: there is no file {calibration}", fix="write camera.yaml, or give --calibration FILE"
         )
-    camera = read_camera_yaml(calibration)
+    camera, camera_notes = read_calibration(calibration, images)
     track = read_pose_track(options, folder / "poses.tum")
     images, times_s, note = _timed_images(folder, images, key, track)
     if track.timestamps_s is None:
@@ -94,7 +95,7 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
         track=track,
         camera=camera,
         options=options,
-        notes=[*pairs.notes, note],
+        notes=[*pairs.notes, note, *camera_notes],
     )
 
 

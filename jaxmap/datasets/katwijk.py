@@ -26,10 +26,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.crs import to_utm, utm_crs
 from jaxmap.datasets.images import list_images
-from jaxmap.datasets.matlab import read_matlab_calibration
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import JaxmapError
@@ -97,14 +96,12 @@ class RoverCamera:
 
     Attributes:
         folder: the folder of its images in a part.
-        size_px: (width, height).
         T_mount_camera: (4, 4), the left optical frame in the frame of its mount.
         T_imu_mount: (4, 4), the mount in the IMU frame, at zero pan and tilt.
         on_pan_tilt: whether the mount is the pan-tilt unit of `ptu.txt`.
     """
 
     folder: str
-    size_px: tuple[int, int]
     T_mount_camera: np.ndarray
     T_imu_mount: np.ndarray
     on_pan_tilt: bool = False
@@ -113,13 +110,11 @@ class RoverCamera:
 CAMERAS = {
     "loccam": RoverCamera(
         folder="LocCam",
-        size_px=(1024, 768),
         T_mount_camera=_transform((-0.382, -0.078, 0.557), (0.572, 0.572, -0.416, -0.416)),
         T_imu_mount=np.eye(4),
     ),
     "pancam": RoverCamera(
         folder="PanCam",
-        size_px=(1280, 960),
         T_mount_camera=_transform((0.010, 0.250, 0.054), (0.5, -0.5, 0.5, -0.5)),
         T_imu_mount=_transform((-0.138, -0.005, 1.286), (0.0, 0.0, 1.0, 0.0)),
         on_pan_tilt=True,
@@ -189,7 +184,7 @@ def open_katwijk(folder: Path, options: ReadOptions) -> StereoSequence:
         T_child_camera, mount_notes = body_to_camera(folder, camera, frame_times_s)
         pose_notes += mount_notes
     path = options.calibration or config_folder() / "cameras" / f"katwijk_{camera.folder.lower()}.yaml"
-    is_matlab = path.suffix.lower() == ".mat"
+    calibration, camera_notes = read_calibration(path, [frame.left for frame in frames])
     absolute = Path(os.path.abspath(folder))
     by_traverse = re.fullmatch(r"(?i)traverse.*", absolute.parent.name)
     return assemble(
@@ -198,11 +193,11 @@ def open_katwijk(folder: Path, options: ReadOptions) -> StereoSequence:
         where=folder,
         frames=frames,
         track=track,
-        camera=read_matlab_calibration(path, camera.size_px) if is_matlab else read_camera_yaml(path),
+        camera=calibration,
         options=replace(options, poses_world="z_up" if options.poses_world == "auto" else options.poses_world),
         T_child_camera=T_child_camera,
         crs=crs,
-        notes=[*image_notes, *pose_notes],
+        notes=[*image_notes, *pose_notes, *camera_notes],
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.images import first_image_size_px, list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import read_timestamps, with_timestamps
@@ -44,11 +44,10 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
     frames = _frames(folder, left, right, times_s)
     P_left, P_right = _projections(folder / "calib.txt", left, right)
     if options.calibration:
-        camera = read_camera_yaml(options.calibration)
+        camera, camera_notes = read_calibration(options.calibration, [frame.left for frame in frames])
     else:
-        camera = camera_of_projections(
-            P_left, P_right, first_image_size_px((frame.left for frame in frames), folder), folder / "calib.txt"
-        )
+        size_px, camera_notes = first_image_size_px((frame.left for frame in frames), folder), ()
+        camera = camera_of_projections(P_left, P_right, size_px, folder / "calib.txt")
 
     track = read_pose_track(options, absolute.parent.parent / "poses" / f"{absolute.name}.txt")
     if track.timestamps_s is None:
@@ -72,7 +71,7 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
         camera=camera,
         options=options,
         T_child_camera=None if options.poses else T_camera0_left,
-        notes=notes,
+        notes=[*notes, *camera_notes],
     )
 
 

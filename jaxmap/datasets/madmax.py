@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.images import list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.pairing import nearest_pairs
@@ -47,8 +47,9 @@ def open_madmax(folder: Path, options: ReadOptions) -> StereoSequence:
     """
     frames, dropped = _paired_frames(folder)
     calibration = _beside(folder, "calibration")
-    camera = read_camera_yaml(options.calibration) if options.calibration else _read_camera(calibration)
-    notes = [f"{dropped} images have no partner within 5 ms and are left out"] * bool(dropped)
+    given = options.calibration and read_calibration(options.calibration, [frame.left for frame in frames])
+    camera, camera_notes = given or (_read_camera(calibration), ())
+    notes = [*[f"{dropped} images have no partner within 5 ms and are left out"] * bool(dropped), *camera_notes]
     T_body_camera = None
     if options.poses:
         track = read_pose_track(options, folder)

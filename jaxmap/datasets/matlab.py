@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ _METRES |= {"inches": 0.0254, "": 0.001}
 _STEREO_KEYS = ("RotationOfCamera2", "TranslationOfCamera2")
 _CAMERA_KEYS = ("CameraParameters1", "CameraParameters2")
 
+Size = Callable[[], tuple[int, int]]
+
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 """Storage types of elements."""
 
@@ -35,7 +37,15 @@ _HEADER = 8
 _MAX_DEPTH = 16
 
 
-def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
+def is_matlab(path: Path) -> bool:
+    """Whether a file is MATLAB's, by its name or its first bytes."""
+    if path.suffix.lower() == ".mat" or not path.is_file():
+        return path.suffix.lower() == ".mat"
+    with path.open("rb") as file:
+        return file.read(6) == b"MATLAB"
+
+
+def read_matlab_calibration(path: Path, size_px: Size) -> StereoRig:
     """Reads the `stereoParameters` of a MAT file (version 5 to 7).
 
     MATLAB multiplies row vectors from the left, so that its matrices are the transposes of OpenCV's,
@@ -43,7 +53,7 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
 
     Args:
         path: the file.
-        size_px: (width, height), for old files, which lack it.
+        size_px: gives (width, height), for old files, which lack it.
 
     Raises:
         JaxmapError: not a MAT file, without a stereo calibration, or with skewed pixels, which are not modelled.
@@ -118,7 +128,11 @@ def _structs(value: Any) -> Iterator[Mapping[str, Any]]:
 
 
 def _rig(
-    left: Mapping[str, Any], right: Mapping[str, Any], stereo: Mapping[str, Any], size_px: tuple[int, int], path: Path
+    left: Mapping[str, Any],
+    right: Mapping[str, Any],
+    stereo: Mapping[str, Any],
+    size_px: Size,
+    path: Path,
 ) -> StereoRig:
     unit = str(left.get("WorldUnits", "mm")).lower()
     if unit not in _METRES:
@@ -165,10 +179,10 @@ def _array(struct: Mapping[str, Any], key: str, shape: tuple[int, ...], path: Pa
         raise JaxmapError(f"{key} is missing, or is not {size} numbers", where=path, fix="restore the file") from fault
 
 
-def _image_size(camera: Mapping[str, Any], size_px: tuple[int, int]) -> tuple[int, int]:
+def _image_size(camera: Mapping[str, Any], size_px: Size) -> tuple[int, int]:
     """MATLAB's ImageSize is [rows, columns], and empty in old calibrations."""
     size = np.ravel(camera.get("ImageSize", []))
-    return (int(size[1]), int(size[0])) if size.size == 2 and size.dtype.kind in "iuf" and size.all() else size_px
+    return (int(size[1]), int(size[0])) if size.size == 2 and size.dtype.kind in "iuf" and size.all() else size_px()
 
 
 def structs_of_objects(stream: bytes, where: object) -> list[dict[str, Any]]:

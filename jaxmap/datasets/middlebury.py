@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from jaxmap.datasets import calibration_files
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import make_pose_track
 from jaxmap.datasets.projections import camera_of_projections
@@ -44,7 +44,9 @@ def open_middlebury(folder: Path, options: ReadOptions) -> StereoSequence:
         where=folder,
         frames=[FrameRef("im0", 0.0, folder / "im0.png", folder / "im1.png")],
         track=read_pose_track(options, folder) if options.poses else make_pose_track(np.zeros(1), np.eye(4)[None]),
-        camera=read_camera_yaml(options.calibration) if options.calibration else camera,
+        camera=calibration_files.read_calibration(options.calibration, [folder / "im0.png"]).camera
+        if options.calibration
+        else camera,
         options=options,
         notes=[f"disparities reach {disparities} px by calib.txt (--stereo.num-disparities)"] * bool(disparities),
         true_disparity=read_truth if (folder / TRUTH).is_file() else None,

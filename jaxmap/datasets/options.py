@@ -87,7 +87,7 @@ class ReadOptions:
     baseline_unit: LengthUnit = "m"
     """Unit in which the calibration gives the stereo baseline."""
     calibration: Path | None = None
-    """Camera file in place of the sequence's own."""
+    """Camera file in place of the sequence's own: jaxmap's YAML, or one of OpenCV, ROS, Kalibr or MATLAB."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam; KITTI: grey (the default)
     or color; planetary archives: navcam, front_hazcam, rear_hazcam, pancam, mastcam, mastcam_z or other."""

@@ -17,7 +17,7 @@ from jaxmap.datasets import (
     tartanair,
 )
 from jaxmap.datasets.base import Reader, StereoSequence
-from jaxmap.datasets.crs import check_crs
+from jaxmap.datasets.crs import check_crs, check_metres
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.samples import open_sample
 from jaxmap.errors import JaxmapError, UsageError
@@ -67,7 +67,7 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
     if options.crs is not None:
         check_crs(options.crs)
     if str(source).startswith(SAMPLE_PREFIX):
-        return open_sample(str(source).removeprefix(SAMPLE_PREFIX), options)
+        return _in_metres(open_sample(str(source).removeprefix(SAMPLE_PREFIX), options))
     path = Path(source)
     if not path.is_dir() and not (path.is_file() and any(reader.recognises(path) for reader in READERS.values())):
         what = f"{source} is a file, but no bag" if path.exists() else f"there is no folder {source}"
@@ -76,7 +76,14 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
     if options.camera is not None and options.camera not in reader.cameras:
         fix = f"choose {' or '.join(reader.cameras)}" if reader.cameras else "leave the option out"
         raise UsageError(f"{reader.name} has no camera {options.camera!r}", where="--camera", fix=fix)
-    return reader.open(path, options)
+    return _in_metres(reader.open(path, options))
+
+
+def _in_metres(sequence: StereoSequence) -> StereoSequence:
+    """The sequence, whose coordinate reference system must be one of metres."""
+    if sequence.crs is not None:
+        check_metres(sequence.crs, sequence.T_world_camera[:, :3, 3] + sequence.site_origin)
+    return sequence
 
 
 def _recognise(path: Path) -> Reader:

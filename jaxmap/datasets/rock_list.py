@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,10 +11,10 @@ from jaxtyping import Float64
 
 from jaxmap.datasets.crs import Extent, crs_text, transform_between
 from jaxmap.datasets.label_raster import OTHER, TARGET, UNLABELLED, LabelRaster
-from jaxmap.datasets.text_files import data_lines
+from jaxmap.datasets.number_tables import DEGREES, UNITS_M, Column, read_number_table
 from jaxmap.errors import JaxmapError
 
-SUFFIXES = (".txt", ".csv")
+SUFFIXES = (".txt", ".csv", ".tsv")
 SIZE_CLASSES = ("small", "medium", "large")
 DEFAULT_DIAMETERS_M: Mapping[str, float] = {"small": 0.3, "medium": 0.6, "large": 1.0}
 """Assumed for lists without diameters; Katwijk's files of positions have the size class in their names."""
@@ -25,7 +24,12 @@ PIXEL_M = 0.02
 _MAX_PIXELS = 2**29
 _FARTHEST, _NARROWEST_M, _WIDEST_M = 1e9, 1e-3, 1e3
 _CIRCLE_POINTS = 16
-_SIZE_NAMES = ("diameter", "diameter_m", "size", "size_m", "footprint_m")
+_X_NAMES = dict.fromkeys(("x", "easting", "east", "e", "utm_e", "x_utm", "xcoord", "longitude", "lon", "rechtswert"))
+_Y_NAMES = dict.fromkeys(("y", "northing", "north", "n", "utm_n", "y_utm", "ycoord", "latitude", "lat", "hochwert"))
+_SIZE_NAMES = dict.fromkeys(
+    ("diameter", "size", "footprint", "width", "diam", "d", "durchmesser", "diamètre", "diametre")
+)
+_RADIUS_NAMES = dict.fromkeys(("radius", "rayon", "r"))
 
 
 class RockList(NamedTuple):
@@ -44,18 +48,21 @@ def find_rock_lists(source: Path) -> list[Path]:
 
 
 def read_rock_lists(paths: Sequence[Path], diameters_m: Mapping[str, float] = DEFAULT_DIAMETERS_M) -> RockList:
-    """Reads lists of rocks, one rock per line: `x y` or `x y diameter`, separated by spaces, commas or semicolons.
+    """Reads lists of rocks, one rock per line: `x y` or `x y diameter`, in any form that `read_number_table` reads.
 
-    A header line names the columns (`x`, `y`, and `diameter` or `size`). Without a diameter, that of the size class
+    A header line names the columns (`x`, `y`, and `diameter`, `size` or `radius`), and may name units
+    (`diameter [cm]`); metres otherwise. Without a diameter, that of the size class
     in the file name (`small-rocks-...txt`) is taken, and that of the medium class where the name has none.
 
     Raises:
-        JaxmapError: a missing file, a line of another length, a word that is not a number, or no rocks; with the line.
+        JaxmapError: a missing file, a line of another length, a word that is not a number, an unknown unit, or no
+            rocks; with the line.
     """
     tables, notes = [], []
     for path in paths:
-        rows, sized = _read_table(path)
-        if not sized:
+        rows, told = _read_table(path)
+        notes += told
+        if rows.shape[1] == 2:
             size_class = next((name for name in SIZE_CLASSES if name in path.name.lower()), None)
             diameter_m = diameters_m[size_class or "medium"]
             rows = np.column_stack([rows, np.full(len(rows), diameter_m)])
@@ -104,50 +111,61 @@ def draw_rocks(rocks: RockList, place: Extent, crs: str | None = None, name: str
     return LabelRaster(labels, T_crs_pixel, place.crs, name, notes)
 
 
-def _read_table(path: Path) -> tuple[np.ndarray, bool]:
-    """x, y and, where the second value is true, the diameter."""
-    lines = [(line, re.split(r"[\s,;]+", text.strip(" \t\r,;"))) for line, text in data_lines(path)]
-    columns = [0, 1, 2]
-    if lines and not any(map(_is_number, lines[0][1])):
-        columns = _columns([word.lower().strip('"') for word in lines[0][1]], path)
-        lines = lines[1:]
-    if not lines:
+class _Table(NamedTuple):
+    rows: Float64[np.ndarray, "N columns"]
+    notes: tuple[str, ...]
+
+
+def _read_table(path: Path) -> _Table:
+    """x, y and, in a third column, the diameter where it is known; and what was told by the header."""
+    table = read_number_table(path)
+    if not table.rows:
         raise JaxmapError("no rocks", where=path, fix="write a line x y [diameter] for each rock")
-    sized = len(columns) == 3 and len(lines[0][1]) > columns[2]
-    wanted = columns[: 3 if sized else 2]
-    rows = np.empty((len(lines), len(wanted)))
-    for row, (line, words) in enumerate(lines):
-        if len(words) != len(lines[0][1]) or len(words) <= max(wanted):
-            raise JaxmapError(f"{len(words)} columns", where=f"{path} line {line}", fix="write x y [diameter]")
+    count = len(table.rows[0][1])
+    if table.columns is None and count > 3:
+        raise JaxmapError(
+            f"{count} columns without a header", where=path, fix="name them in a first line, x y diameter among them"
+        )
+    places = [(index, 1.0) for index in range(count)] if table.columns is None else _columns(table.columns, path)
+    if len(places) < 2:
+        raise JaxmapError("1 columns", where=f"{path} line {table.rows[0][0]}", fix="write x y [diameter]")
+    rows = np.empty((len(table.rows), len(places)))
+    for row, (line, cells) in enumerate(table.rows):
         try:
-            rows[row] = [float(words[column]) for column in wanted]
+            rows[row] = [float(cells[index]) * scale for index, scale in places]
         except ValueError as error:
             raise JaxmapError(f"{error}"[:80], where=f"{path} line {line}", fix="write x y [diameter]") from error
-        far, wide = np.abs(rows[row, :2]).max(), rows[row, 2] if sized else 1.0
+        far, wide = np.abs(rows[row, :2]).max(), rows[row, 2] if len(places) == 3 else 1.0
         if not far < _FARTHEST or not _NARROWEST_M <= wide < _WIDEST_M:
             raise JaxmapError(
                 "a number that is not finite or beyond the earth, or a diameter that is not positive",
                 where=f"{path} line {line}",
                 fix="correct the line",
             )
-    return rows, sized
+    notes = [f"{path.name}: numbers with decimal commas"] * table.decimal_comma
+    scaled = [index for index, scale in places if scale != 1]
+    if table.columns is not None and scaled:
+        named = ", ".join(f"{table.columns[index].name} [{table.columns[index].unit or 'm'}]" for index in scaled)
+        notes.append(f"{path.name}: {named} taken into metres, radii into diameters")
+    return _Table(rows, tuple(notes))
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _columns(names: list[str], path: Path) -> list[int]:
-    """The columns of x, y and, if there is one, the diameter."""
-    wanted = (("x",), ("y",), _SIZE_NAMES)
-    found = [next((i for i, name in enumerate(names) if name in known), None) for known in wanted]
-    if found[0] is None or found[1] is None:
-        raise JaxmapError(f"the columns are {' '.join(names)}"[:80], where=path, fix="name them x y diameter")
-    return [column for column in found if column is not None]
+def _columns(columns: Sequence[Column], path: Path) -> list[tuple[int, float]]:
+    """The columns of x, y and, if there is one, the diameter, each with what it is multiplied by."""
+    places: list[tuple[int, float]] = []
+    for kind, names in (("x", _X_NAMES), ("y", _Y_NAMES), ("diameter", {**_SIZE_NAMES, **_RADIUS_NAMES})):
+        found = [index for name in names for index, column in enumerate(columns) if column.name == name]
+        if not found and kind != "diameter":
+            named = " ".join(column.name for column in columns)
+            raise JaxmapError(f"the columns are {named}"[:80], where=path, fix="name them x y diameter")
+        for index in found[:1]:
+            name, unit = columns[index]
+            if unit not in UNITS_M and not (kind != "diameter" and unit in DEGREES):
+                raise JaxmapError(
+                    f"{name} in the unit {unit!r:.20}", where=path, fix=f"give it in {', '.join(filter(None, UNITS_M))}"
+                )
+            places.append((index, UNITS_M.get(unit, 1.0) * (2.0 if name in _RADIUS_NAMES else 1.0)))
+    return places
 
 
 def _outline(centres: np.ndarray, radii_m: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from jaxmap.datasets.bag_topics import (
 )
 from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.bit_depth import bits_note, used_bits
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.options import Bits, ReadOptions
 from jaxmap.datasets.pairing import nearest_pairs
 from jaxmap.errors import FrameError, JaxmapError
@@ -167,7 +167,9 @@ def _camera(
 ) -> tuple[StereoCamera | StereoRig, list[str]]:
     """The calibration given, or that of both CameraInfo; and how the images were taken."""
     if options.calibration:
-        return read_camera_yaml(options.calibration), []
+        rectified = is_rectified_name(pair.left) or options.bag.images_are == "rectified"
+        found = read_calibration(options.calibration, rectified=rectified)
+        return found.camera, [*found.notes]
     left, right = (log.infos[topic] for topic in infos)
     frames = [shot.frame for shot in shots]
     T_left_right = None

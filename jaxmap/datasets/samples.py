@@ -11,7 +11,7 @@ import skimage
 from jaxtyping import Float32
 
 from jaxmap.datasets.base import FrameRef, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.katwijk import open_katwijk
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import make_pose_track
@@ -66,7 +66,7 @@ def _open_motorcycle(options: ReadOptions) -> StereoSequence:
         track=read_pose_track(options, options.poses)
         if options.poses
         else make_pose_track(np.zeros(1), np.eye(4)[None]),
-        camera=read_camera_yaml(options.calibration) if options.calibration else camera,
+        camera=read_calibration(options.calibration, [left]).camera if options.calibration else camera,
         options=options,
         true_disparity=lambda frame: motorcycle_disparity(),
     )

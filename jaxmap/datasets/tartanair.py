@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
-from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.folder import recognises as is_plain_folder
 from jaxmap.datasets.images import first_image_size_px, list_images
 from jaxmap.datasets.options import ReadOptions
@@ -66,9 +66,10 @@ def open_tartanair(folder: Path, options: ReadOptions) -> StereoSequence:
     assert layout is not None
     frames = _frames(folder, layout)
     if options.calibration:
-        camera = read_camera_yaml(options.calibration)
+        camera, camera_notes = read_calibration(options.calibration, [frame.left for frame in frames])
     else:
-        camera = _simulators_camera(first_image_size_px((frame.left for frame in frames), folder), folder)
+        size_px, camera_notes = first_image_size_px((frame.left for frame in frames), folder), ()
+        camera = _simulators_camera(size_px, folder)
     track, bad = (read_pose_track(options, folder), 0) if options.poses else _read_poses(folder / layout.poses, frames)
     sequence = assemble(
         name=f"tartanair_{Path(os.path.abspath(folder)).name}",
@@ -79,7 +80,11 @@ def open_tartanair(folder: Path, options: ReadOptions) -> StereoSequence:
         camera=camera,
         options=options if options.poses else replace(options, poses_world="z_up"),
         T_child_camera=None if options.poses else T_FRD_OPTICAL,
-        notes=["frames numbered 0, 1, 2 ... s, as no times are known", *[f"{bad} poses are not whole"] * bool(bad)],
+        notes=[
+            "frames numbered 0, 1, 2 ... s, as no times are known",
+            *[f"{bad} poses are not whole"] * bool(bad),
+            *camera_notes,
+        ],
     )
     return sequence if options.poses else replace(sequence, T_world_source=T_ENU_NED)
 

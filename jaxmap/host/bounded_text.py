@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ MOST_TEXT_BYTES = 512 << 20
 MOST_DIGITS = 40
 """Of a whole number; float64 has 17 digits, 64 bits 20."""
 
+_OPENCV_TAG = re.compile(r"(?<=:)[ \t]+!!opencv-[a-z-]+(?=[ \t]*$)", re.MULTILINE)
 _FIX = "correct or restore the file"
 
 
@@ -53,7 +55,8 @@ def read_text(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> str:
 def read_yaml(path: Path) -> Any:
     """The content of a YAML file.
 
-    OpenCV's header `%YAML:1.0`, invalid in YAML but present in its files and in EuRoC's, is accepted.
+    OpenCV's header `%YAML:1.0`, invalid in YAML but present in its files and in EuRoC's, is accepted, and its tags
+    (`!!opencv-matrix`) are passed over: their content is a mapping.
 
     Raises:
         JaxmapError: what `read_text` and `parse_yaml` refuse.
@@ -62,7 +65,7 @@ def read_yaml(path: Path) -> Any:
     if text.startswith("%YAML:"):
         # The line break is kept, so that errors name the right line.
         text = "".join(text.partition("\n")[1:])
-    return parse_yaml(text, path)
+    return parse_yaml(_OPENCV_TAG.sub("", text), path)
 
 
 def parse_yaml(text: str, where: object, bounds: Bounds = YAML_BOUNDS) -> Any:

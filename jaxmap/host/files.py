@@ -112,7 +112,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = target.with_name(f".{target.stem}.tmp-{os.getpid()}{target.suffix}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        _remove_strays(target)
+        remove_strays(target)
         yield temporary
         sync(temporary)
         os.replace(temporary, target)
@@ -124,7 +124,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def _remove_strays(target: Path) -> None:
+def remove_strays(target: Path) -> None:
     """Removes temporary files of processes that were killed while writing the same file."""
     for stray in target.parent.glob(f".{glob.escape(target.stem)}.tmp-*{glob.escape(target.suffix)}"):
         process = stray.name.removeprefix(f".{target.stem}.tmp-").removesuffix(target.suffix)

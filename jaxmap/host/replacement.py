@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from jaxmap.errors import JaxmapError
-from jaxmap.host.files import sync, write_error
+from jaxmap.host.files import remove_strays, sync, write_error
 from jaxmap.host.output_folder import locked
 
 Outputs = Callable[[], Iterable[Path]]
@@ -97,6 +97,7 @@ class Replacement:
         try:
             if self._whole.exists():
                 for path in [*self._outputs()]:
+                    remove_strays(path)
                     if path.exists():
                         aside = self._old / path.relative_to(self._folder)
                         aside.parent.mkdir(parents=True, exist_ok=True)

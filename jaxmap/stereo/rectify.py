@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 from jaxmap.errors import JaxmapError
 from jaxmap.types import MOST_CAMERA_PX, StereoCamera, make_stereo_camera
 
+DistortionModel = Literal["opencv", "equidistant"]
+
 
 @dataclass(frozen=True)
 class StereoRig:
@@ -19,7 +21,8 @@ class StereoRig:
 
     `x_right = R_right_left @ x_left + t_right_left_m`; pixel centres are integers (MATLAB's
     principal points minus 1); distortion is `k1 k2 p1 p2 [k3 [k4 k5 k6]]`. `doffs_px` is added to the
-    disparity offset of the rectified pair, to correct a constant error.
+    disparity offset of the rectified pair, to correct a constant error. Of an equidistant (fisheye) camera the four
+    coefficients are those of Kannala and Brandt (2006), as of `cv2.fisheye`.
     """
 
     K_left: np.ndarray
@@ -31,6 +34,7 @@ class StereoRig:
     width_px: int
     height_px: int
     doffs_px: float = 0.0
+    model: DistortionModel = "opencv"
 
 
 def make_stereo_rig(
@@ -43,6 +47,7 @@ def make_stereo_rig(
     t_right_left_m: ArrayLike,
     size_px: tuple[int, int],
     doffs_px: float = 0.0,
+    model: DistortionModel = "opencv",
     where: object = "calibration",
 ) -> StereoRig:
     """Checks and builds a `StereoRig`; `size_px` is (width, height).
@@ -64,11 +69,11 @@ def make_stereo_rig(
     arrays["t_right_left_m"] = arrays["t_right_left_m"].reshape(-1)
     for side in ("distortion_left", "distortion_right"):
         arrays[side] = arrays[side].reshape(-1)
-        if arrays[side].size not in (4, 5, 8, 12, 14):
+        if arrays[side].size not in ((4,) if model == "equidistant" else (4, 5, 8, 12, 14)):
             raise JaxmapError(
                 f"{side} has {arrays[side].size} coefficients",
                 where=where,
-                fix="give k1 k2 p1 p2, or 5, 8, 12 or 14 of them",
+                fix="give k1 k2 p1 p2, or 5, 8, 12 or 14 of them; of an equidistant camera k1 k2 k3 k4",
             )
     shapes = dict(K_left=(3, 3), K_right=(3, 3), R_right_left=(3, 3), t_right_left_m=(3,))
     for name, value in arrays.items():
@@ -90,7 +95,8 @@ def make_stereo_rig(
             raise JaxmapError(f"{side} has a focal length that is not positive", where=where)
     if not abs(doffs_px) <= MOST_CAMERA_PX:
         raise JaxmapError(f"doffs_px is {doffs_px}", where=where, fix="give a finite number")
-    return StereoRig(**arrays, width_px=int(size_px[0]), height_px=int(size_px[1]), doffs_px=float(doffs_px))
+    width_px, height_px = int(size_px[0]), int(size_px[1])
+    return StereoRig(**arrays, width_px=width_px, height_px=height_px, doffs_px=float(doffs_px), model=model)
 
 
 class Rectifier(NamedTuple):
@@ -119,17 +125,22 @@ def make_rectifier(rig: StereoRig, alpha: float = 0.0) -> Rectifier:
         JaxmapError: the right camera is not to the right of the left one.
     """
     size = (rig.width_px, rig.height_px)
-    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-        rig.K_left,
-        rig.distortion_left,
-        rig.K_right,
-        rig.distortion_right,
-        size,
-        rig.R_right_left,
-        rig.t_right_left_m.reshape(3, 1),
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=alpha,
-    )
+    if rig.model == "equidistant":
+        R_left, R_right, P_left, P_right = _rectified_fisheye(rig)
+        undistorted = cv2.fisheye.initUndistortRectifyMap
+    else:
+        R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+            rig.K_left,
+            rig.distortion_left,
+            rig.K_right,
+            rig.distortion_right,
+            size,
+            rig.R_right_left,
+            rig.t_right_left_m.reshape(3, 1),
+            flags=cv2.CALIB_ZERO_DISPARITY,
+            alpha=alpha,
+        )
+        undistorted = cv2.initUndistortRectifyMap
     if abs(P_right[1, 3]) > abs(P_right[0, 3]):
         raise JaxmapError(
             "the cameras stand one above the other", where="calibration", fix="only horizontal pairs can be matched"
@@ -146,11 +157,27 @@ def make_rectifier(rig: StereoRig, alpha: float = 0.0) -> Rectifier:
         where="calibration (left and right swapped?)",
     )
     # Fixed-point maps: half the memory traffic of float ones, 1/32 px.
-    left = cv2.initUndistortRectifyMap(rig.K_left, rig.distortion_left, R_left, P_left, size, cv2.CV_16SC2)
-    right = cv2.initUndistortRectifyMap(rig.K_right, rig.distortion_right, R_right, P_right, size, cv2.CV_16SC2)
+    left = undistorted(rig.K_left, rig.distortion_left, R_left, P_left, size, cv2.CV_16SC2)
+    right = undistorted(rig.K_right, rig.distortion_right, R_right, P_right, size, cv2.CV_16SC2)
     inside = np.full((rig.height_px, rig.width_px), 255, np.uint8)
     seen = cv2.remap(inside, *left, cv2.INTER_LINEAR) == 255
     return Rectifier(camera, R_left, (left[0], left[1]), (right[0], right[1]), seen)
+
+
+def _rectified_fisheye(rig: StereoRig) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations and projections of a rectified pair of equidistant cameras.
+
+    The focal length stays: in the middle no detail is lost, and as theta < tan theta no pixel looks outside the raw
+    image. `cv2.fisheye.stereoRectify` fits the whole view instead, for a wide one with a third of the focal length.
+    """
+    size, zero = (rig.width_px, rig.height_px), np.zeros(5)
+    between = (rig.R_right_left, rig.t_right_left_m.reshape(3, 1))
+    R_left, R_right, *_ = cv2.stereoRectify(rig.K_left, zero, rig.K_right, zero, size, *between)
+    f_px = float(np.mean([rig.K_left[0, 0], rig.K_left[1, 1], rig.K_right[0, 0], rig.K_right[1, 1]]))
+    P_left = np.array([[f_px, 0, (size[0] - 1) / 2, 0], [0, f_px, (size[1] - 1) / 2, 0], [0, 0, 1, 0]])
+    P_right = P_left.copy()
+    P_right[:2, 3] = f_px * (R_right @ rig.t_right_left_m)[:2]
+    return R_left, R_right, P_left, P_right
 
 
 def rectify_image(image: np.ndarray, maps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmap.datasets.crs import to_utm, utm_crs
-from jaxmap.errors import JaxmapError
+from jaxmap.datasets.crs import check_metres, to_utm, utm_crs
+from jaxmap.errors import JaxmapError, UsageError
 
 
 def reference_utm(longitude_deg: float, latitude_deg: float, meridian_deg: float) -> tuple[float, float]:
@@ -54,3 +54,53 @@ def test_zones_are_six_degrees_wide(longitude, latitude, crs):
 def test_places_off_the_earth_are_reported():
     with pytest.raises(JaxmapError, match="is outside the domain of the projection in EPSG:32631"):
         to_utm("EPSG:32631", np.array([4.4]), np.array([1e5]))
+
+
+MARS = "+proj=eqc +a=3396190 +b=3396190 +units=m"
+LOCAL = np.array([[0.0, 0.0, 1.5], [4.0, 6.0, 1.5]])
+DEGREES = np.array([[4.4004, 52.2141, 3.0], [4.4005, 52.2142, 3.0]])
+GEOCENTRIC = np.array([[3903000.0, 300000.0, 5018000.0]])
+FEET = np.array([[985000.0, 195000.0, 30.0], [985020.0, 195010.0, 30.0]])
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "what", "fix"),
+    [
+        ("EPSG:4326", LOCAL, "is in units of a degree", "EPSG:326ZZ"),
+        ("EPSG:4326", DEGREES, "is in units of a degree", "--crs EPSG:32631"),
+        ("EPSG:4258", DEGREES, "is in units of a degree", "--crs EPSG:32631"),
+        ("EPSG:4978", GEOCENTRIC, "geocentric", "--crs EPSG:32631"),
+        ("EPSG:4978", LOCAL, "geocentric", "EPSG:326ZZ"),
+        ("EPSG:2263", FEET, "is in units of a US survey foot", "--crs EPSG:32618"),
+        ("EPSG:2263", LOCAL, "is in units of a US survey foot", "--crs EPSG:32618"),
+        ("EPSG:3857", np.array([[489_000.0, 6_841_000.0, 3.0]]), "metres that are 1.63 times too long", "EPSG:32631"),
+        ("EPSG:4326+5773", LOCAL, "is in units of a degree", "EPSG:326ZZ"),
+        (
+            "+proj=longlat +a=3396190 +b=3376200 +no_defs",
+            LOCAL,
+            "is in units of a degree",
+            "projected system of that body",
+        ),
+        ("+proj=utm +zone=31 +units=us-ft", LOCAL, "is in units of a US survey foot", "EPSG:326"),
+    ],
+)
+def test_a_system_that_is_not_of_metres_is_refused_with_the_zone_of_the_place(name, path, what, fix):
+    with pytest.raises(UsageError) as caught:
+        check_metres(name, path)
+    assert what in caught.value.what and fix in str(caught.value.fix)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "EPSG:32631",
+        "EPSG:3857",
+        "EPSG:3031",
+        "EPSG:28992",
+        "EPSG:31467",
+        "+proj=eqc +a=3396190 +b=3396190 +units=m",
+        "EPSG:32631+5773",
+    ],
+)
+def test_systems_of_metres_pass(name):
+    check_metres(name, LOCAL)

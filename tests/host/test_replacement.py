@@ -57,6 +57,12 @@ def test_a_whole_run_takes_the_place_of_the_old_and_the_rest_stays(folder):
     assert contents(folder) == NEW | MINE
 
 
+def test_what_a_killed_writer_left_goes_with_the_old_run(folder):
+    (folder / ".map.tmp-999999999.txt").touch()
+    replace(folder)
+    assert contents(folder) == NEW | MINE
+
+
 @pytest.mark.parametrize("function", ["rename", "replace", "rmtree"])
 @pytest.mark.parametrize("call", range(7))
 def test_a_process_killed_at_any_call_leaves_the_old_run_or_the_new(function, call, folder, monkeypatch):
