@@ -18,8 +18,8 @@ from jaxmap.checks.motions import (
     choose_steps,
     ground_normal,
     measure_motion,
-    read_left,
-    read_matched,
+    read_shrunk,
+    shrunk_camera,
 )
 from jaxmap.datasets.base import StereoSequence
 from jaxmap.datasets.options import PosesAre
@@ -32,9 +32,10 @@ from jaxmap.datasets.pose_axes import (
     with_other_quaternions,
 )
 from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.match import Matcher, StereoOptions
 
 WIDTH_PX = 600
-"""Features are found on images shrunk to about this width."""
+"""Images are shrunk to about this width."""
 
 FITS_DEG, SUSPECT_DEG = 25.0, 12.0
 """Steps and turns whose directions are off by less fit; those above the second do not where others are far better."""
@@ -111,16 +112,19 @@ def pose_findings(sequence: StereoSequence, front_end: StereoFrontEnd, steps: in
         front_end: its rectification and matcher.
         steps: how many pairs of frames to look at; none leaves what the poses alone say.
     """
-    camera, T_raw_rectified = front_end.camera, front_end.T_raw_rectified
-    shrink = max(1, round(camera.width_px / WIDTH_PX))
+    T_raw_rectified = front_end.T_raw_rectified
+    shrink = max(1, round(front_end.camera.width_px / WIDTH_PX))
+    camera = shrunk_camera(front_end.camera, shrink)
+    matcher = Matcher(StereoOptions(), camera.width_px)
     motions, normals = [], []
     for i, j in choose_steps(sequence.T_world_camera, steps):
-        first, left_j = read_matched(sequence, front_end, i), read_left(sequence, front_end, j)
-        if first is None or left_j is None:
+        pair_i, pair_j = (read_shrunk(sequence, front_end, index, shrink) for index in (i, j))
+        if pair_i is None or pair_j is None:
             continue
-        if (normal := ground_normal(camera, first.disparity_px)) is not None:
+        disparity_px = matcher(*pair_i)
+        if (normal := ground_normal(camera, disparity_px)) is not None:
             normals.append((i, T_raw_rectified[:3, :3] @ normal))
-        motion = measure_motion(camera, (i, j), first.left, first.disparity_px, left_j, shrink)
+        motion = measure_motion(camera, (i, j), pair_i[0], disparity_px, pair_j[0])
         if motion is not None:
             motions.append(motion._replace(T_i_j=T_raw_rectified @ motion.T_i_j @ T_raw_rectified.T))
     left_out = "mend or remove these lines of the pose file"
