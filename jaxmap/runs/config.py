@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -50,6 +50,18 @@ class MapConfig(ReadOptions):
     relief: ReliefOptions = field(default_factory=ReliefOptions)
     deeplab: DeeplabOptions = field(default_factory=DeeplabOptions)
     ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
+
+
+@options("")
+class CheckConfig(ReadOptions):
+    """What decides how a sequence is read and matched."""
+
+    stereo: StereoOptions = field(default_factory=StereoOptions)
+
+    @classmethod
+    def of(cls, config: MapConfig) -> CheckConfig:
+        """Those settings of a map."""
+        return cls(**{one.name: getattr(config, one.name) for one in fields(cls)})
 
 
 _SETTINGS = Settings(MapConfig, "map", given=("sequence",))

@@ -46,7 +46,7 @@ def match_features(left: np.ndarray, right: np.ndarray, shrink: int = 1) -> Floa
     """
     # Sand has little contrast: OpenCV's threshold would leave a few features on it.
     detector = cv2.SIFT.create(FEATURES, contrastThreshold=0.01)
-    found = [detector.detectAndCompute(_shrunk_grey(image, shrink), None) for image in (left, right)]  # type: ignore[call-overload]
+    found = [detector.detectAndCompute(shrunk_grey(image, shrink), None) for image in (left, right)]  # type: ignore[call-overload]
     if any(len(points) < 2 for points, _ in found):
         return np.zeros((0, 4))
     (points_left, descriptors_left), (points_right, descriptors_right) = found
@@ -59,14 +59,13 @@ def match_features(left: np.ndarray, right: np.ndarray, shrink: int = 1) -> Floa
     best, back = distance2.argmin(axis=1), distance2.argmin(axis=0)
     nearest, second = np.partition(distance2, 1, axis=1)[:, :2].T
     kept = rows[(back[best] == rows) & (nearest < RATIO**2 * second)]
-    pixels = [
-        np.array([point.pt for point in points]) for points in (points_left, points_right)
-    ]
+    pixels = [np.array([point.pt for point in points]) for points in (points_left, points_right)]
     both = np.concatenate([pixels[0][kept], pixels[1][best[kept]]], axis=1)
     return (both + 0.5) * shrink - 0.5
 
 
-def _shrunk_grey(image: np.ndarray, shrink: int) -> np.ndarray:
+def shrunk_grey(image: np.ndarray, shrink: int) -> np.ndarray:
+    """An image, grey or RGB, as grey and shrunk so many times; what is left of a whole pixel at its edges goes."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     if shrink == 1:
         return grey
@@ -143,9 +142,7 @@ def rotate_right(
     return turned[:, :2] / turned[:, 2:]
 
 
-def alignment_homography(
-    camera: StereoCamera, rotation_rad: Float64[np.ndarray, "3"]
-) -> Float64[np.ndarray, "3 3"]:
+def alignment_homography(camera: StereoCamera, rotation_rad: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     """K R inverse(K) of the right camera: it takes pixels of the right image to where they should lie."""
     K = np.array(
         [
