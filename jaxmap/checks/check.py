@@ -30,7 +30,7 @@ class Extent(NamedTuple):
     width_px: int
 
 
-THOROUGH, QUICK = Extent(8, 1024), Extent(3, 512)
+THOROUGH, QUICK = Extent(6, 1024), Extent(3, 512)
 """Some 5 to 10 s, and 1 s or less, for images of 1024 columns on two cores."""
 
 

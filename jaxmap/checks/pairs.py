@@ -94,8 +94,8 @@ def _near_limit(front_end: StereoFrontEnd, alignment: Alignment, certain: float)
     nearest_px = float(np.quantile(beyond, 0.95))
     needed = int(-(-(nearest_px + 2 - lowest_px) // 16) * 16)
     what = (
-        f"{len(beyond) / len(disparity_px):.0%} of the matches are nearer than the {matcher.num_disparities} disparities "
-        f"searched can see: nothing nearer than {bf_px_m / (limit_px + doffs_px):.2f} m, while something stands at "
+        f"{len(beyond) / len(disparity_px):.0%} of the matches are nearer than the {matcher.num_disparities} "
+        f"disparities searched can see: nothing nearer than {bf_px_m / (limit_px + doffs_px):.2f} m, while something stands at "
         f"{bf_px_m / (nearest_px + doffs_px):.2f} m"
     )
     fix = f"--stereo.num-disparities {needed}"

@@ -61,7 +61,7 @@ def main(words: Sequence[str]) -> int:
             "stops": "",
             "confidence": "sure",
             "what": "what is wrong",
-            "fix": "what mends it",
+            "fix": "mended by",
         }
         console.table(f"{arguments.sequence}: {len(rows)} found, in {looked_at}", columns, rows)
     else:

@@ -39,7 +39,8 @@ class MapConfig(ReadOptions):
     the names that deeplab.class_map gives or, without any, all classes of the network. Points of its other
     classes are mapped without a class. Each class takes as much memory as the occupancy."""
     strict: bool = False
-    """Stop at the first unusable frame instead of going on without it."""
+    """Stop where the quick check of the sequence finds something that makes the map wrong, and at the first unusable
+    frame, instead of going on with a note."""
     seed: Annotated[int, NotNegative, Lt(2**31)] = 0
     """Seed of all randomness."""
     grid: GridOptions = field(default_factory=GridOptions)

@@ -25,7 +25,8 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    `too_near` is the share of pixels that were left out because they are nearer than the searched disparities reach.
+    `too_near` is the share of pixels that were left out because they are nearer than the searched disparities reach, and
+    `nearest_px` the disparity of the nearest of them.
     """
 
     left: np.ndarray
@@ -34,6 +35,7 @@ class RectifiedFrame(NamedTuple):
     rectify_s: float
     match_s: float
     too_near: float = 0.0
+    nearest_px: float = 0.0
 
 
 class StereoFrontEnd:
@@ -86,7 +88,7 @@ class StereoFrontEnd:
         with timed_stage("rectify", stages_s):
             for side, image in (("left", left), ("right", right)):
                 if (reason := blank_reason(image)) is not None:
-                    raise FrameError(f"the {side} image {reason}: nothing can be matched in it", fix=_BLANK_FIX)
+                    raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
             left, right = self.rectify(left, right)
         with timed_stage("match", stages_s):
             disparity_px = self.matcher(left, right)
@@ -94,9 +96,11 @@ class StereoFrontEnd:
                 disparity_px[~self.rectifier.seen] = np.nan
             near = None if self._near_guard is None else self._near_guard(left, right)
             if near is not None:
-                disparity_px[near] = np.nan
-        too_near = 0.0 if near is None else float(near.mean())
-        return RectifiedFrame(left, right, disparity_px, stages_s["rectify"], stages_s["match"], too_near)
+                disparity_px[near.pixels] = np.nan
+        times_s = stages_s["rectify"], stages_s["match"]
+        if near is None:
+            return RectifiedFrame(left, right, disparity_px, *times_s)
+        return RectifiedFrame(left, right, disparity_px, *times_s, float(near.pixels.mean()), near.disparity_px)
 
     def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rectified pair; the images as they are where nothing is to be done.

@@ -8,6 +8,7 @@ time.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,6 +22,13 @@ RANGES = 3
 """The range of disparities that is searched, in ranges of the matcher."""
 
 MOST_OF_WIDTH = 0.8
+
+
+class TooNear(NamedTuple):
+    """Pixels whose surface is too near to be matched or hidden behind one that is, and the disparity of the nearest."""
+
+    pixels: Bool[np.ndarray, "H W"]
+    disparity_px: float
 
 
 class NearGuard:
@@ -39,7 +47,7 @@ class NearGuard:
         options = replace(StereoOptions(), num_disparities=max(16, int(reach_px) // 16 * 16), edge_step_px=0)
         self._coarse = Matcher(options, width_px)
 
-    def __call__(self, left: np.ndarray, right: np.ndarray) -> Bool[np.ndarray, "H W"] | None:
+    def __call__(self, left: np.ndarray, right: np.ndarray) -> TooNear | None:
         """Pixels of the left image that are too near to be matched, or that such a surface hides from the right camera.
 
         Args:
@@ -47,17 +55,18 @@ class NearGuard:
             right: likewise.
 
         Returns:
-            None where there are none.
+            Pixels and disparity; None where nothing is too near.
         """
         # A surface as near as the limit is found by the matcher itself.
         disparity_px = self._shrink * self._coarse(shrunk_grey(left, self._shrink), shrunk_grey(right, self._shrink))
         near = disparity_px > self._limit_px + self._shrink
         if not near.any():
             return None
+        nearest_px = float(np.quantile(disparity_px[near], 0.95))
         reach = 2 * -(-self._limit_px // self._shrink) + 1
         beside = cv2.dilate(near.astype(np.uint8), np.ones((5, max(reach, 5)), np.uint8)) > 0
         near |= beside & np.isnan(disparity_px)
         near_full = np.zeros(left.shape[:2], bool)
         rows, columns = (length * self._shrink for length in near.shape)
         near_full[:rows, :columns] = np.kron(near, np.ones((self._shrink, self._shrink), bool))
-        return near_full
+        return TooNear(near_full, nearest_px)
