@@ -95,8 +95,8 @@ def _near_limit(front_end: StereoFrontEnd, alignment: Alignment, certain: float)
     needed = int(-(-(nearest_px + 2 - lowest_px) // 16) * 16)
     what = (
         f"{len(beyond) / len(disparity_px):.0%} of the matches are nearer than the {matcher.num_disparities} "
-        f"disparities searched can see: nothing nearer than {bf_px_m / (limit_px + doffs_px):.2f} m, while something stands at "
-        f"{bf_px_m / (nearest_px + doffs_px):.2f} m"
+        f"disparities searched can see: nothing nearer than {bf_px_m / (limit_px + doffs_px):.2f} m, while "
+        f"something stands at {bf_px_m / (nearest_px + doffs_px):.2f} m"
     )
     fix = f"--stereo.num-disparities {needed}"
     return [Finding("near-limit", share > NEAR_STOPS_SHARE, certain, what, fix)]

@@ -122,12 +122,13 @@ def run_plan(
 
 def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
-    if log.too_near:
+    said = {finding.kind for finding in plan.findings}
+    if log.too_near and not said & {"near-limit", "vertical-disparity"}:
         matcher = plan.front_end.matcher
         needed = -(-(log.nearest_px + 1 - matcher.options.min_disparity_px) // 16) * 16
         yield (
-            f"in {log.too_near} of {log.fused} frames something is nearer than {matcher.num_disparities} disparities can "
-            f"see, and was left out: the map has a hole there; --stereo.num-disparities {needed:.0f} sees it"
+            f"in {log.too_near} of {log.fused} frames something is nearer than {matcher.num_disparities} disparities "
+            f"can see, and was left out: the map has a hole there; --stereo.num-disparities {needed:.0f} sees it"
         )
     if log.without_ground:
         yield (
