@@ -22,14 +22,12 @@ class PairSample(NamedTuple):
 
     Attributes:
         name: of the frame.
-        index: of the frame in the sequence.
         left: as read.
         right: as read.
         matches: column and row left, column and row right on the rectified images, (M, 4).
     """
 
     name: str
-    index: int
     left: Image
     right: Image
     matches: Float64[np.ndarray, "M 4"]
@@ -88,6 +86,6 @@ def take_samples(
         if reasons:
             blank.append((ref.name, " and ".join(reasons)))
             continue
-        pairs.append(PairSample(ref.name, index, left, right, match_features(*rectified, shrink)))
+        pairs.append(PairSample(ref.name, left, right, match_features(*rectified, shrink)))
     found = np.concatenate([np.zeros((0, 4)), *(pair.matches for pair in pairs)])
     return Samples(tuple(pairs), tuple(blank), tuple(unreadable), estimate_alignment(front_end.camera, found))

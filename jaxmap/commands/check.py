@@ -18,8 +18,8 @@ class CheckArguments:
     """Check whether the images, the calibration, the poses and the times of a sequence fit each other.
 
     Looks at some frames spread over the sequence, and says what is wrong, how sure that is, and which option or step
-    mends it. Exit status: 0 where nothing would make a map wrong, 1 where something would. The first frames of map,
-    tune, refine and train --supervision map are a quick form of it; --strict stops them there.
+    mends it. Exit status: 0 where nothing would make a map wrong, 1 where something would. map, tune, refine and train
+    --supervision map begin with a quick form of it, on three frames; with --strict they stop where it finds something.
     """
 
     sequence: tyro.conf.Positional[str]
