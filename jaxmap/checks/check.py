@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmap.checks.clock import clock_findings
 from jaxmap.checks.finding import Finding
 from jaxmap.checks.images import image_findings
 from jaxmap.checks.pairs import pair_findings
@@ -24,13 +25,15 @@ class Extent(NamedTuple):
     Attributes:
         frames: how many, at most.
         width_px: images are shrunk to about so many columns at least.
+        clock: whether the clocks of images and poses are compared, on many frames in a row.
     """
 
     frames: int
     width_px: int
+    clock: bool
 
 
-THOROUGH, QUICK = Extent(6, 1024), Extent(3, 512)
+THOROUGH, QUICK = Extent(6, 1024, clock=True), Extent(3, 512, clock=False)
 """Some 5 to 10 s, and 1 s or less, for images of 1024 columns on two cores."""
 
 
@@ -57,6 +60,8 @@ def check_sequence(sequence: StereoSequence, front_end: StereoFrontEnd, extent: 
     started_s = time.perf_counter()
     samples = _samples(sequence, front_end, extent)
     findings = [*image_findings(samples), *pair_findings(samples, front_end)]
+    if extent.clock:
+        findings += clock_findings(sequence, front_end)
     findings.sort(key=lambda finding: (not finding.stops, -finding.confidence))
     looked_at: dict[str, Any] = {
         "frames": samples.looked_at,
