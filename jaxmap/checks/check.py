@@ -12,6 +12,7 @@ from jaxmap.checks.clock import clock_findings
 from jaxmap.checks.finding import Finding
 from jaxmap.checks.images import image_findings
 from jaxmap.checks.pairs import pair_findings
+from jaxmap.checks.pose_convention import pose_findings
 from jaxmap.checks.samples import Samples, spread_indices, take_samples
 from jaxmap.datasets.base import StereoSequence
 from jaxmap.errors import JaxmapError
@@ -25,16 +26,21 @@ class Extent(NamedTuple):
     Attributes:
         frames: how many, at most.
         width_px: images are shrunk to about so many columns at least.
+        steps: between how many pairs of frames the motion is measured.
         clock: whether the clocks of images and poses are compared, on many frames in a row.
     """
 
     frames: int
     width_px: int
+    steps: int
     clock: bool
 
 
-THOROUGH, QUICK = Extent(6, 1024, clock=True), Extent(3, 512, clock=False)
+THOROUGH, QUICK = Extent(6, 1024, steps=6, clock=True), Extent(3, 512, steps=2, clock=False)
 """Some 5 to 10 s, and 1 s or less, for images of 1024 columns on two cores."""
+
+_UNMEASURABLE = {"swapped-images", "rows-disagree", "vertical-disparity"}
+_WILD_FIX = "mend the poses; those left out leave gaps in the map"
 
 
 class CheckReport(NamedTuple):
@@ -60,7 +66,11 @@ def check_sequence(sequence: StereoSequence, front_end: StereoFrontEnd, extent: 
     started_s = time.perf_counter()
     samples = _samples(sequence, front_end, extent)
     findings = [*image_findings(samples), *pair_findings(samples, front_end)]
-    if extent.clock:
+    findings += [Finding("wild-poses", True, 0.9, fault, _WILD_FIX) for fault in sequence.pose_faults]
+    # Motions are measured by disparities: where these are wrong, only what the poses themselves say is looked at.
+    measurable = not {finding.kind for finding in findings} & _UNMEASURABLE
+    findings += pose_findings(sequence, front_end, extent.steps if measurable else 0)
+    if extent.clock and measurable:
         findings += clock_findings(sequence, front_end)
     findings.sort(key=lambda finding: (not finding.stops, -finding.confidence))
     looked_at: dict[str, Any] = {

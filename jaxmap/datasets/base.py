@@ -8,7 +8,7 @@ them to `assemble`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,16 @@ from jaxtyping import Float64
 from jaxmap.datasets.calibration import read_mounting
 from jaxmap.datasets.images import ImageArray, first_image_size_px, read_image_pair
 from jaxmap.datasets.options import ReadOptions
-from jaxmap.datasets.poses import PoseTrack, poses_at, read_poses, split_site_origin, to_z_up, with_timestamps
+from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE, PoseReading, stand_upright, to_z_up
+from jaxmap.datasets.poses import (
+    PoseTrack,
+    poses_at,
+    read_poses,
+    split_site_origin,
+    with_timestamps,
+    without_wild_poses,
+)
+from jaxmap.datasets.units import METRES, UNIT_NAMES, unit_that_overlaps, with_baseline_unit
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
@@ -59,6 +68,8 @@ class StereoSequence:
         site_origin: float64 (3,), what was subtracted from the positions.
         crs: the coordinate reference system of `site_origin`, e.g. "EPSG:32631", or None.
         notes: what the reader reports to the user (frames left out, conventions assumed).
+        pose_faults: those of the notes that tell of poses that were left out as unusable.
+        pose_reading: the conventions that the poses were read by.
         read_pair: reads the images of one frame.
     """
 
@@ -72,6 +83,8 @@ class StereoSequence:
     site_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    pose_faults: tuple[str, ...] = ()
+    pose_reading: PoseReading = field(default_factory=PoseReading)
 
 
 @dataclass(frozen=True)
@@ -103,10 +116,10 @@ def read_stereo_pair(frame: FrameRef) -> StereoPair:
 
 
 def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False) -> PoseTrack:
-    """The poses given by the options, else those of the sequence.
+    """The poses given by the options, else those of the sequence, in metres and of the left camera's optical axes.
 
     Args:
-        options: `poses` has precedence.
+        options: `poses` has precedence; the conventions of the file.
         own: the sequence's own pose file, which need not exist.
         allow_body: whether the reader can use poses of the body (EuRoC csv).
 
@@ -119,14 +132,33 @@ def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False
             f"the sequence has no poses: there is no file {own}",
             fix="give them with --poses FILE (TUM text, T_world_camera of the left camera)",
         )
-    track = read_poses(path)
-    if track.child == "body" and not allow_body:
-        raise JaxmapError(
-            "EuRoC csv holds poses of the body, not of the camera",
-            where=path,
-            fix="give T_world_camera of the left camera as TUM text",
+    track = read_poses(path, options.quaternion, options.poses_time_unit)
+    notes = [*track.notes]
+    T = reading_of(options, track).camera_poses(track.T)
+    T[:, :3, 3] *= METRES[options.poses_unit]
+    child = "camera" if options.pose_convention != "auto" else track.child
+    if child == "body" and not allow_body:
+        if not stand_upright(T[track.usable]):
+            raise JaxmapError(
+                "a csv of EuRoC's form holds poses of the body, not of the camera",
+                where=path,
+                fix="name their axes with --pose-convention: optical if they are of the left camera, body (x forward, "
+                "y left, z up) if their frame sits at the camera; else give T_world_camera as TUM text",
+            )
+        child = "camera"
+        notes.append(
+            f"the poses in {path.name} stand upright as those of a camera's optical axes, and are taken for them"
         )
-    return track
+    return replace(track, T=T, child=child, notes=tuple(notes))
+
+
+def reading_of(options: ReadOptions, track: PoseTrack) -> PoseReading:
+    """The conventions that poses are read by; the world is z up until it is found out."""
+    return PoseReading(
+        pose_convention="optical" if options.pose_convention == "auto" else options.pose_convention,
+        poses_are=options.poses_are,
+        quaternion=track.quaternion,
+    )
 
 
 def assemble(
@@ -170,6 +202,7 @@ def assemble(
     _check_frames(frames, timestamps_s, camera, where)
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
+    track = without_wild_poses(track)
     assert track.timestamps_s is not None
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
 
@@ -182,12 +215,7 @@ def assemble(
         )
     kept = selected[has_pose[selected]]
     if not len(kept):
-        raise JaxmapError(
-            f"none of {len(selected)} frames has a pose: the frames span {_span(timestamps_s[selected])}, "
-            f"the poses {_span(track.timestamps_s)}",
-            where=track.where,
-            fix=f"check that both use one clock, or that poses lie within max_pose_gap_s {options.max_pose_gap_s:g} s",
-        )
+        raise _no_pose(timestamps_s[selected], track, options)
     T_source_camera = T_source_child[has_pose]
     if T_child_camera is not None:
         T_source_camera = T_source_camera @ (T_child_camera if T_child_camera.ndim == 2 else T_child_camera[has_pose])
@@ -196,7 +224,7 @@ def assemble(
     T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
 
-    all_notes = list(notes)
+    all_notes = [*notes, *track.notes, *track.faults]
     if options.poses_world == "auto" and not np.array_equal(T_world_source, np.eye(4)):
         all_notes.append("the poses' world is taken for camera-like (y down) and turned z-up")
     if len(kept) < len(selected):
@@ -208,7 +236,7 @@ def assemble(
     return StereoSequence(
         name=name,
         dataset=dataset,
-        camera=camera,
+        camera=with_baseline_unit(camera, options.baseline_unit),
         frames=tuple(frames[index] for index in kept),
         T_world_camera=T_world_camera[row_of_frame[kept]],
         read_pair=read_pair,
@@ -216,6 +244,10 @@ def assemble(
         site_origin=site_origin,
         crs=options.crs or crs,
         notes=tuple(all_notes),
+        pose_faults=track.faults,
+        pose_reading=reading_of(options, track)._replace(
+            poses_world=next(name for name, T in T_Z_UP_SOURCE.items() if np.array_equal(T, T_world_source))
+        ),
     )
 
 
@@ -238,6 +270,20 @@ def _check_frames(
             where=where,
             fix="give the calibration of these images",
         )
+
+
+def _no_pose(timestamps_s: np.ndarray, track: PoseTrack, options: ReadOptions) -> JaxmapError:
+    """No frame has a pose: says so, and which unit of the poses' times would make clocks meet."""
+    assert track.timestamps_s is not None
+    fix = f"check that both use one clock, or that poses lie within max_pose_gap_s {options.max_pose_gap_s:g} s"
+    if unit := unit_that_overlaps(track.timestamps_s, timestamps_s, track.time_unit):
+        fix = f"they would meet if the poses' times were in {UNIT_NAMES[unit]}: --poses-time-unit {unit}"
+    return JaxmapError(
+        f"none of {len(timestamps_s)} frames has a pose: the frames span {_span(timestamps_s)}, "
+        f"the poses {_span(track.timestamps_s)}",
+        where=track.where,
+        fix=fix,
+    )
 
 
 def _span(timestamps_s: np.ndarray) -> str:

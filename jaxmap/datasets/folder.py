@@ -13,6 +13,7 @@ from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.images import list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, read_timestamps
+from jaxmap.datasets.units import PER_SECOND, unit_by_size
 from jaxmap.errors import JaxmapError
 
 _TIME_FILES = ("times.txt", "timestamps.txt")
@@ -99,8 +100,7 @@ def _timed_images(folder: Path, images: list[Path], track: PoseTrack) -> tuple[l
 
 
 def _per_second(times: np.ndarray) -> float:
-    largest = np.abs(times).max()
-    return next((count for least, count in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest >= least), 1.0)
+    return PER_SECOND[unit_by_size(float(np.abs(times).max())) or "s"]
 
 
 READER = Reader("folder", "a plain folder with left, right and camera.yaml", recognises, open_folder)

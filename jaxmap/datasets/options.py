@@ -7,8 +7,18 @@ from typing import Annotated, Literal
 
 from jaxmap.host.settings import Positive, options
 
-PosesWorld = Literal["auto", "z_up", "camera"]
-"""World of a pose file: z up; x right, y down, z forward; or detected from the cameras' up axes."""
+PosesWorld = Literal["auto", "z_up", "z_down", "y_up", "camera"]
+"""World of a pose file: z up; x north, y east, z down; x right, y up, z backward; x right, y down, z forward; or
+detected from the cameras' up axes."""
+
+PoseConvention = Literal["auto", "optical", "body", "frd", "opengl"]
+"""Axes of the frame whose poses a file holds: x right, y down, z forward; x forward, y left, z up; x forward, y right,
+z down; x right, y up, z backward; or what the form of the file says."""
+
+PosesAre = Literal["T_world_camera", "T_camera_world"]
+QuaternionOrder = Literal["auto", "xyzw", "wxyz"]
+TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
+LengthUnit = Literal["m", "cm", "mm"]
 
 
 @options("")
@@ -27,7 +37,21 @@ class ReadOptions:
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: PosesWorld = "auto"
-    """World of the poses: z up, camera-like (y down), or find out."""
+    """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
+    pose_convention: PoseConvention = "auto"
+    """Axes that the poses describe: of the camera (optical: x right, y down, z forward), of a body at the camera's
+    place (body: x forward, y left, z up; frd: x forward, y right, z down), of OpenGL (x right, y up, z backward), or
+    as the form of the file says."""
+    poses_are: PosesAre = "T_world_camera"
+    """What takes points into what: the poses of the camera in the world, or the inverse."""
+    quaternion: QuaternionOrder = "auto"
+    """Order of a quaternion in the pose file; by default as its header or its form says."""
+    poses_time_unit: TimeUnit = "auto"
+    """Unit of the times in the pose file; by default told from their size."""
+    poses_unit: LengthUnit = "m"
+    """Unit of the positions in the pose file."""
+    baseline_unit: LengthUnit = "m"
+    """Unit in which the calibration gives the stereo baseline."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
     camera: str | None = None

@@ -39,7 +39,10 @@ from jaxmap.tuning.traverse_loss import (
 SOFT_START_M = 0.03
 """Where the width of the plane's threshold starts when the settings have a sharp one, which nothing can move."""
 
-_DATA = ("labels", "labels_are", "poses", "poses_world", "calibration", "start", "stop", "stride")
+_DATA = (
+    *("labels", "labels_are", "calibration", "baseline_unit", "start", "stop", "stride", "poses", "poses_world"),
+    *("pose_convention", "poses_are", "poses_unit", "poses_time_unit", "quaternion"),
+)
 """Settings that are of the data tuned on, and not of how they are mapped."""
 
 
