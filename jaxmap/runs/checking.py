@@ -73,7 +73,9 @@ def warn_of_faults(
     for finding in findings:
         if strict and finding.stops:
             raise JaxmapError(finding.what, where=sequence.name, fix=f"{finding.fix}; or go on without --strict")
-        notify(f"note: {finding_line(finding)}")
+        # What was wrong with the pose file the reader's own notes say.
+        if finding.kind != "unusable-poses":
+            notify(f"note: {finding_line(finding)}")
     return findings
 
 

@@ -306,6 +306,8 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         JaxmapError: the data or the settings do not serve.
     """
     sequence = open_sequence(source, config)
+    if config.strict and sequence.pose_faults:
+        raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
     front_end = open_front_end(sequence, config.stereo, notify)
     camera = front_end.camera
     _describe_sequence(sequence, camera, notify)
