@@ -46,8 +46,9 @@ class ReliefOptions(GroundOptions):
     slope_gain arctan(slope)`. The defaults were fitted on simulated pairs of other worlds than those it is tried on.
     """
 
-    combine: Annotated[bool, tyro.conf.arg(aliases=["--relief"])] = False
-    """Add relief to the labels of a network or of files; --relief for short."""
+    combine: bool | None = None
+    """Add relief to the labels of a network or of files; --relief and --no-relief for short. By default to those of a
+    network that knows the two classes below."""
     bias: float = -2.7
     """Log-odds of rock on level ground of middling height."""
     threshold_m: Annotated[float, Interval(ge=0, le=2)] = 0.024

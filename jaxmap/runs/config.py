@@ -23,8 +23,9 @@ LabellerName = Literal["plane", "relief", "deeplab", "files", "none"]
 class MapConfig(ReadOptions):
     """Everything that decides what a map comes out as."""
 
-    labeller: LabellerName = "plane"
-    """What labels the points: the MLESAC plane, relief above the local ground, a network, files, or nothing."""
+    labeller: LabellerName = "deeplab"
+    """What labels the points: a network (with relief beside it), relief above the local ground alone, the MLESAC plane,
+    files, or nothing."""
     model: Path | None = None
     """Model file of the network, with the deeplab labeller (train and weights import write them); by default the
     bundled one, for rovers on sand."""

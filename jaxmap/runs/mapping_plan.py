@@ -165,7 +165,7 @@ def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None
         if config.model is not None:
             raise UsageError(
                 f"--model is given, but the labeller is {config.labeller}",
-                fix="add --labeller deeplab, or leave it out",
+                fix="take --labeller deeplab, or leave it out",
             )
         return None, None
     path = config.model or bundled("rover.safetensors")
@@ -215,10 +215,12 @@ def choose_labeller(
         deeplab, shrink = config.deeplab, BUNDLED_WIDTH_PX / camera.width_px
         if config.model is None and deeplab.size_px is None and shrink < 1:
             deeplab = replace(deeplab, size_px=(round(shrink * camera.height_px), BUNDLED_WIDTH_PX))
-        return _with_relief(make_deeplab_labeller(network, classes, deeplab), config)
+        labeller = make_deeplab_labeller(network, classes, deeplab)
+        known = {config.relief.ground, config.relief.rock} <= set(labeller.classes)
+        return _with_relief(labeller, config, by_default=known)
     classes = ROVER_CLASSES if classes is None else classes
     if label_folder is not None:
-        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config)
+        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config, by_default=False)
     if config.labeller == "relief":
         return make_relief_labeller(classes, config.relief)
     if config.labeller == "plane":
@@ -226,8 +228,9 @@ def choose_labeller(
     return make_no_labeller()
 
 
-def _with_relief(labeller: Labeller, config: MapConfig) -> Labeller:
-    return combine_with_relief(labeller, config.relief) if config.relief.combine else labeller
+def _with_relief(labeller: Labeller, config: MapConfig, *, by_default: bool) -> Labeller:
+    combine = by_default if config.relief.combine is None else config.relief.combine
+    return combine_with_relief(labeller, config.relief) if combine else labeller
 
 
 Notify = Callable[[str], None]

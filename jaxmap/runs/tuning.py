@@ -58,10 +58,13 @@ def tuned_config(config: MapConfig, params: TunedParams) -> MapConfig:
     """
     fusion = {name: _rounded(value) for name, value in fusion_numbers(params.fusion).items()}
     config = replace(config, fusion=replace(config.fusion, **fusion))
-    if params.labeller:
-        numbers = {name: _rounded(value) for name, value in params.labeller.items()}
-        section = config.labeller
-        config = replace(config, **{section: replace(getattr(config, section), **numbers)})
+    numbers = {name: _rounded(value) for name, value in params.labeller.items()}
+    # Relief may stand beside another labeller, whose numbers then come first.
+    for section in (config.labeller, "relief"):
+        options = getattr(config, section, None)
+        own = {name: numbers.pop(name) for name in list(numbers) if hasattr(options, name)}
+        if own:
+            config = replace(config, **{section: replace(options, **own)})
     return config
 
 

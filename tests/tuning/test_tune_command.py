@@ -7,6 +7,7 @@ import json
 import re
 from html import escape
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
@@ -18,11 +19,13 @@ from tune_faults import tune_words, write_truth
 import jaxmap.host.output_folder
 import jaxmap.runs.tuning
 from jaxmap.errors import JaxmapError
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.host.output_folder import locked
 from jaxmap.mapping.store import load_map
-from jaxmap.runs.config import load_config
-from jaxmap.runs.tuning import descent_notes
+from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.tuning import descent_notes, tuned_config
 from jaxmap.tuning.descent import Losses, Step
+from jaxmap.tuning.parametrisation import TunedParams
 
 SHORT = ("--steps", "6", "--held-out-share", "0.4")
 
@@ -234,3 +237,14 @@ def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, tr
     assert len(told["traverses"]) == 2
     assert told["before"]["softness_m"] == 0.0 and told["stages"][0]["parameters"]["softness_m"] > 0
     assert {"sigma_m", "threshold_m"} <= told["before"].keys()
+
+
+@pytest.mark.parametrize("labeller, own", [("deeplab", {"temperature": 2.0}), ("files", {}), ("relief", {})])
+def test_tuned_numbers_go_to_the_options_they_are_of(labeller, own):
+    """Relief beside another labeller has numbers of its own, and so may the other have."""
+    fusion = make_fusion_params(("sand", "rock"))
+    numbers = {name: jnp.float32(value) for name, value in {**own, "bias": -1.5, "softness_m": 0.04}.items()}
+    config = tuned_config(MapConfig(labeller=labeller), TunedParams(fusion, numbers))
+    assert (config.relief.bias, config.relief.softness_m) == (-1.5, 0.04)
+    assert config.deeplab.temperature == own.get("temperature", 1.0)
+    assert config.plane == MapConfig().plane
