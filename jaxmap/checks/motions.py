@@ -25,7 +25,12 @@ REPROJECTION_PX = 2.0
 STEP_M, STEP_DEG, LONGEST_STEP = 0.15, 2.0, 10
 """The second frame of a pair is the first that lies so far off or is turned so much by the poses, or else the tenth."""
 
-PLANE_POINTS, PLANE_HYPOTHESES, PLANE_TOLERANCE, PLANE_SHARE = 1500, 150, 0.02, 0.5
+LEAST_PARALLAX = 0.02
+"""Motions shorter than this share of the depth of what is seen have no certain direction."""
+
+LEAST_TURN_DEG = 1.0
+
+PLANE_POINTS, PLANE_HYPOTHESES, PLANE_TOLERANCE, PLANE_SHARE = 600, 100, 0.02, 0.5
 """A plane holds half of the points to a 50th of their depth, or it is none."""
 
 
@@ -45,6 +50,16 @@ class Motion(NamedTuple):
     T_i_j: Float64[np.ndarray, "4 4"]
     inliers: int
     depth_m: float
+
+    @property
+    def steps(self) -> bool:
+        """Whether it is long enough to have a direction."""
+        return bool(np.linalg.norm(self.T_i_j[:3, 3]) > LEAST_PARALLAX * self.depth_m)
+
+    @property
+    def turns(self) -> bool:
+        """Whether it turns enough to have an axis."""
+        return bool(angle_deg(self.T_i_j[:3, :3]) > LEAST_TURN_DEG)
 
 
 def choose_steps(T_world_camera: Float64[np.ndarray, "N 4 4"], count: int) -> list[tuple[int, int]]:
@@ -181,3 +196,10 @@ def _points(camera: StereoCamera, disparity_px: np.ndarray, pixels: np.ndarray) 
 def angle_deg(R: np.ndarray) -> np.ndarray:
     """Angles of rotations (..., 3, 3)."""
     return np.degrees(np.arccos(np.clip((np.trace(R, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))
+
+
+def between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles between vectors (M, 3); 90 where one is zero, which has no direction."""
+    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    cosines = np.divide((a * b).sum(axis=1), lengths, out=np.zeros(len(a)), where=lengths > 0)
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from jaxmap.checks.camera_mounting import mounting_findings
 from jaxmap.checks.finding import Finding
 from jaxmap.checks.motions import (
     Motion,
-    angle_deg,
+    between_deg,
     choose_steps,
     ground_normal,
     measure_motion,
@@ -35,10 +36,6 @@ from jaxmap.stereo.front_end import StereoFrontEnd
 WIDTH_PX = 600
 """Features are found on images shrunk to about this width."""
 
-LEAST_PARALLAX = 0.02
-"""Motions shorter than this share of the depth of what is seen have no certain direction."""
-
-LEAST_TURN_DEG = 1.0
 FITS_DEG, SUSPECT_DEG = 25.0, 12.0
 """Steps and turns whose directions are off by less fit; those above the second do not where others are far better."""
 
@@ -166,7 +163,7 @@ def pose_convention(
     T_source_camera[:, :3, 3] += 0.0 if site_origin is None else site_origin
     T_source_camera = T_Z_UP_SOURCE[reading.poses_world].T @ T_source_camera
     T_file = reading.file_poses(T_source_camera)
-    told = [motion for motion in motions if _tells(motion)]
+    told = [motion for motion in motions if motion.steps or motion.turns]
     fits = _fits(reading, T_file, told, up_camera_measured)
     used = next(fit for fit in fits if not fit.changes)
     # Noise alone must not make another reading look better.
@@ -176,7 +173,8 @@ def pose_convention(
     best_deg = min((fit.off_deg for fit in fitting), default=np.inf)
     far_better = used.off_deg > max(SUSPECT_DEG, FAR_BETTER * best_deg)
     if used.off_deg < FITS_DEG and used.up > UPRIGHT and not far_better:
-        return _scale_findings(used, told, baseline_m)
+        mounting = mounting_findings(used.T_source_camera, told, reading)
+        return [*mounting, *_scale_findings(used, told, baseline_m)]
     if not fitting:
         return _disagreement(used, told)
     best = fitting[0]
@@ -190,20 +188,8 @@ def pose_convention(
         what += f", and by {best.off_deg:.0f} if read otherwise"
     fix = " or ".join([_options(reading, best.reading), *(_options(reading, rival.reading) for rival in rivals[:2])])
     found = Finding("pose-convention", True, round(float(np.clip(certain, 0.3, 0.99)), 2), what, fix)
-    return [found, *_scale_findings(best, told, baseline_m)]
-
-
-def _tells(motion: Motion) -> bool:
-    """Whether a motion is long enough, or turns enough, to be compared."""
-    return _steps(motion) or _turns(motion)
-
-
-def _steps(motion: Motion) -> bool:
-    return bool(np.linalg.norm(motion.T_i_j[:3, 3]) > LEAST_PARALLAX * motion.depth_m)
-
-
-def _turns(motion: Motion) -> bool:
-    return bool(angle_deg(motion.T_i_j[:3, :3]) > LEAST_TURN_DEG)
+    mounting = mounting_findings(best.T_source_camera, told, best.reading)
+    return [found, *mounting, *_scale_findings(best, told, baseline_m)]
 
 
 def _changed(used: PoseReading, other: PoseReading) -> list[str]:
@@ -241,17 +227,10 @@ def _off_deg(T_source_camera: np.ndarray, motions: Sequence[Motion]) -> float:
     i, j = np.array([(motion.i, motion.j) for motion in motions]).T
     by_poses = rigid_inverse(T_source_camera[i]) @ T_source_camera[j]
     by_images = np.stack([motion.T_i_j for motion in motions])
-    steps, turns = ([shows(motion) for motion in motions] for shows in (_steps, _turns))
+    steps, turns = [motion.steps for motion in motions], [motion.turns for motion in motions]
     vectors = [Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (by_poses, by_images)]
     kinds = ((steps, by_poses[:, :3, 3], by_images[:, :3, 3]), (turns, *vectors))
-    return max(float(np.median(_between_deg(a[known], b[known]))) for known, a, b in kinds if any(known))
-
-
-def _between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles between vectors (M, 3); 90 where one is zero, which has no direction."""
-    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    cosines = np.divide((a * b).sum(axis=1), lengths, out=np.zeros(len(a)), where=lengths > 0)
-    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return max(float(np.median(between_deg(a[known], b[known]))) for known, a, b in kinds if any(known))
 
 
 def _up(R_world_camera: np.ndarray, positions_m: np.ndarray, normals: Sequence[tuple[int, np.ndarray]]) -> float:
@@ -300,7 +279,7 @@ def _scale_findings(fit: _Fit, motions: Sequence[Motion], baseline_m: float | No
     factors = []
     for motion in motions:
         step_m = np.linalg.norm(fit.T_source_camera[motion.j, :3, 3] - fit.T_source_camera[motion.i, :3, 3])
-        if _steps(motion) and step_m > 0:
+        if motion.steps and step_m > 0:
             factors.append(float(np.linalg.norm(motion.T_i_j[:3, 3]) / step_m))
     if not factors:
         return []

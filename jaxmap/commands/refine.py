@@ -13,6 +13,7 @@ import tyro
 from annotated_types import Interval, MinLen
 
 from jaxmap.commands.console import Console, check_bounds, parse
+from jaxmap.datasets.options import LengthUnit, PoseConvention, PosesAre, PosesWorld, QuaternionOrder, TimeUnit
 
 Adjustable = Literal["poses", "mounting", "baseline", "offset"]
 Positive = Annotated[float, Interval(gt=0, lt=1e4)]
@@ -63,6 +64,20 @@ class RefineArguments:
     """The reader: auto, kitti, euroc, folder or katwijk."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
+    poses_world: PosesWorld = "auto"
+    """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
+    pose_convention: PoseConvention = "auto"
+    """Axes that the poses describe, see jaxmap map --help."""
+    poses_are: PosesAre = "T_world_camera"
+    """What takes points into what: the poses of the camera in the world, or the inverse."""
+    quaternion: QuaternionOrder = "auto"
+    """Order of a quaternion in the pose file."""
+    poses_time_unit: TimeUnit = "auto"
+    """Unit of the times in the pose file."""
+    poses_unit: LengthUnit = "m"
+    """Unit of the positions in the pose file."""
+    baseline_unit: LengthUnit = "m"
+    """Unit in which the calibration gives the stereo baseline."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
     camera: str | None = None
@@ -109,6 +124,13 @@ def main(words: Sequence[str]) -> int:
     options = ReadOptions(
         dataset=arguments.dataset,
         poses=arguments.poses,
+        poses_world=arguments.poses_world,
+        pose_convention=arguments.pose_convention,
+        poses_are=arguments.poses_are,
+        quaternion=arguments.quaternion,
+        poses_time_unit=arguments.poses_time_unit,
+        poses_unit=arguments.poses_unit,
+        baseline_unit=arguments.baseline_unit,
         calibration=arguments.calibration,
         camera=arguments.camera,
         crs=arguments.crs,

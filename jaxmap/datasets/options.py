@@ -26,7 +26,8 @@ class ReadOptions:
     """How a sequence is read, and which of its frames.
 
     `start`, `stop` and `stride` are a Python slice of the frames on disk. Poses are `T_world_camera` of the left
-    camera; a mounting in the calibration file moves the sequence's own poses, not those of `poses`.
+    camera; a mounting in the calibration file moves the sequence's own poses, and those of `poses` where these are of a
+    body by `pose_convention`.
 
     Raises:
         UsageError: a value of another type or out of its bounds.

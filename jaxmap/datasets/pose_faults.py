@@ -81,7 +81,10 @@ def find_wild_poses(timestamps_s: Float64[np.ndarray, "N"], T: Float64[np.ndarra
     kept = np.flatnonzero(~wild)
     cuts = np.flatnonzero(path.jumps(kept[:-1], kept[1:])) + 1
     chains = _chains(path, np.split(kept, cuts))
-    main = max(chains, key=len)
+    # Of two poses either may be wild: rather the one far from the origin.
+    places = [np.median(T[chain, :3, 3], axis=0) for chain in chains]
+    ranks = [(len(chain), -float(np.linalg.norm(place))) for chain, place in zip(chains, places, strict=True)]
+    main = chains[ranks.index(max(ranks))]
     kept_jump_m = 0.0
     for chain in chains:
         if chain is main:

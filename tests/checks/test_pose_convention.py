@@ -171,6 +171,21 @@ def _scaled(T: np.ndarray, factor: float) -> np.ndarray:
     return scaled
 
 
+def test_a_camera_that_is_pitched_on_the_body_of_the_poses_is_told_with_its_mounting():
+    T = drive(2)
+    pitched = np.eye(4)
+    pitched[:3, :3] = Rotation.from_euler("x", -PITCH_DEG, degrees=True).as_matrix()
+    T_world_level = T @ pitched.T
+    body = T_world_level @ T_CHILD_CAMERA["body"].T
+    convention, mounting = pose_convention(body, seen(T), normals_of(T))
+    assert (convention.fix, mounting.kind, mounting.stops) == ("--pose-convention body", "camera-mounting", True)
+    assert "(+18 down)" in mounting.what
+    vector = np.array(mounting.fix.split("rotation_vector_rad: [")[1].split("]")[0].split(", "), float)
+    np.testing.assert_allclose(vector, [-np.radians(PITCH_DEG), 0, 0], atol=0.03)
+    (alone,) = pose_convention(T_world_level, seen(T), normals_of(T), reading=PoseReading("body"))
+    assert alone.fix == mounting.fix
+
+
 def test_poses_of_another_drive_disagree_by_no_convention():
     found = pose_convention(drive(5), seen(drive(6)[:, :, [1, 2, 0, 3]] @ np.eye(4)), [])
     assert all(finding.kind in ("poses-disagree", "pose-convention") for finding in found)
