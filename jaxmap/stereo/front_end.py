@@ -85,6 +85,7 @@ class StereoFrontEnd:
             FrameError: the sizes disagree with each other or with the calibration, or an image shows nothing.
         """
         stages_s: dict[str, float] = {}
+        self._check_sizes(left, right)
         with timed_stage("rectify", stages_s):
             for side, image in (("left", left), ("right", right)):
                 if (reason := blank_reason(image)) is not None:
@@ -108,6 +109,15 @@ class StereoFrontEnd:
         Raises:
             FrameError: the sizes disagree with each other or with the calibration.
         """
+        self._check_sizes(left, right)
+        if self.rectifier is not None:
+            return rectify_image(left, self.rectifier.left_maps), rectify_image(right, self.rectifier.right_maps)
+        if self._right_homography is not None:
+            size_px = (self.camera.width_px, self.camera.height_px)
+            right = cv2.warpPerspective(right, self._right_homography, size_px, flags=cv2.INTER_LINEAR)
+        return left, right
+
+    def _check_sizes(self, left: np.ndarray, right: np.ndarray) -> None:
         expected = (self.camera.height_px, self.camera.width_px)
         for side, image in (("left", left), ("right", right)):
             if image.shape[:2] != expected:
@@ -116,11 +126,6 @@ class StereoFrontEnd:
                     f"{expected[1]}x{expected[0]} px",
                     fix="give the calibration of these images",
                 )
-        if self.rectifier is not None:
-            return rectify_image(left, self.rectifier.left_maps), rectify_image(right, self.rectifier.right_maps)
-        if self._right_homography is not None:
-            right = cv2.warpPerspective(right, self._right_homography, expected[::-1], flags=cv2.INTER_LINEAR)
-        return left, right
 
     def check_order(self, frame: RectifiedFrame, where: object = "") -> None:
         """Rejects a pair whose left and right images are swapped.
