@@ -13,7 +13,6 @@ from jaxmap.datasets.base import StereoSequence
 from jaxmap.errors import FrameError
 from jaxmap.stereo.align import match_features, shrunk_grey
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.rectify import rectify_image
 from jaxmap.types import StereoCamera
 
 MIN_DISPARITY_PX = 3.0
@@ -90,13 +89,9 @@ def read_shrunk(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The rectified pair of a frame, grey and shrunk so many times; None where it cannot be read."""
     try:
-        pair = sequence.read_pair(sequence.frames[index])
+        left, right = front_end.rectify(*sequence.read_pair(sequence.frames[index]))
     except FrameError:
         return None
-    left, right = pair.left, pair.right
-    if front_end.rectifier is not None:
-        left = rectify_image(left, front_end.rectifier.left_maps)
-        right = rectify_image(right, front_end.rectifier.right_maps)
     return shrunk_grey(left, shrink), shrunk_grey(right, shrink)
 
 
