@@ -94,6 +94,14 @@ def test_a_wild_pose_is_taken_out_of_a_track_with_a_fault_that_names_its_line():
     assert track.faults == ("poses.tum: 1 of 2 poses off the path by up to 12034 m and 0 deg (line 4) is left out",)
 
 
+@given(path=paths, factor=st.sampled_from([100.0, 1000.0]))
+def test_a_path_in_another_unit_is_not_wild(path, factor):
+    times_s, T = path
+    T[:, :3, 3] = factor * (T[:, :3, 3] - T[0, :3, 3])
+    if len(T) > 2:
+        assert find_wild_poses(times_s, T).wild.mean() < 0.5
+
+
 def test_of_two_poses_the_far_one_is_wild():
     T = np.tile(np.eye(4), (2, 1, 1))
     T[:, :3, 3] = (9e3, 0, 0), (1, 2, 0)
