@@ -27,6 +27,9 @@ FEW_POSES, FEW_SHARE = 5, 0.1
 FAR_M = 100.0
 """... or if it lies farther away."""
 
+MANY = 0.4
+"""Where a greater share of the poses is off the path, there is no path, and none is left out."""
+
 _CHAINS_SEARCHED = 50
 
 
@@ -101,8 +104,8 @@ def find_wild_poses(timestamps_s: Float64[np.ndarray, "N"], T: Float64[np.ndarra
             wild[chain] = True
         else:
             kept_jump_m = max(kept_jump_m, jump_m)
-    if count > 2 and 2 * wild.sum() > count:
-        # What most poses do is no glitch: the path is in another unit, or of another convention.
+    if count > 2 and wild.mean() > MANY:
+        # What so many poses do is no glitch: the path is in another unit, or of another convention.
         kept_jump_m = max(kept_jump_m, _away(path, wild)[0])
         wild[:] = False
     return WildPoses(wild, *_away(path, wild), kept_jump_m)
