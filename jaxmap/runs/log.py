@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from jaxmap.errors import JaxmapError
@@ -15,7 +16,11 @@ MOST_KEPT = 2048
 TOO_NEAR_SHARE = 0.01
 """A frame is counted where more than this share of it is nearer than can be seen."""
 
-_STRICT = ConfigDict(extra="forbid")
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+Count = Annotated[int, Interval(ge=0, le=2**62)]
+Number = Annotated[float, Interval(ge=-1e15, le=1e15)]
+Seconds = Annotated[float, Interval(ge=0, le=1e15)]
 
 
 @dataclass
@@ -31,10 +36,10 @@ class Sample:
 
     __pydantic_config__ = _STRICT
 
-    kept: list[float] = field(default_factory=list)
-    stride: int = 1
-    count: int = 0
-    total: float = 0.0
+    kept: list[Number] = field(default_factory=list)
+    stride: Annotated[int, Interval(ge=1, le=2**62)] = 1
+    count: Count = 0
+    total: Number = 0.0
 
     def add(self, number: float) -> None:
         """Takes one more."""
@@ -74,18 +79,18 @@ class RunLog:
 
     __pydantic_config__ = _STRICT
 
-    next_index: int = 0
-    fused: int = 0
+    next_index: Count = 0
+    fused: Count = 0
     skipped: list[dict[str, str]] = field(default_factory=list)
     stages_ms: dict[str, Sample] = field(default_factory=dict)
     valid_fractions: Sample = field(default_factory=Sample)
-    points_fused: int = 0
-    without_ground: int | None = None
-    too_near: int = 0
-    nearest_px: float = 0.0
-    total_s: float = 0.0
-    compile_s: float = 0.0
-    temporary_bytes: int = 0
+    points_fused: Count = 0
+    without_ground: Count | None = None
+    too_near: Count = 0
+    nearest_px: Number = 0.0
+    total_s: Seconds = 0.0
+    compile_s: Seconds = 0.0
+    temporary_bytes: Count = 0
     digest: str = ""
     complete: bool = False
 

@@ -24,7 +24,7 @@ from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.geometry.options import GridOptions, Triple
-from jaxmap.host.files import bundled
+from jaxmap.host.files import bundled, real_path
 from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller
@@ -338,7 +338,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         ensemble, pose_errors = draw_ensemble(key, fusion_params, timestamps_s, config.ensemble)
 
     return Plan(
-        source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
+        source=source if source.startswith(SAMPLE_PREFIX) else str(real_path(source)),
         sequence=sequence,
         front_end=front_end,
         labeller=labeller,
