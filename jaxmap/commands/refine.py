@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +13,15 @@ import tyro
 from annotated_types import Interval, MinLen
 
 from jaxmap.commands.console import Console, check_bounds, parse
-from jaxmap.datasets.options import LengthUnit, PoseConvention, PosesAre, PosesWorld, QuaternionOrder, TimeUnit
+from jaxmap.datasets.options import (
+    BagOptions,
+    LengthUnit,
+    PoseConvention,
+    PosesAre,
+    PosesWorld,
+    QuaternionOrder,
+    TimeUnit,
+)
 from jaxmap.host.settings import Place, count
 
 Adjustable = Literal["poses", "mounting", "baseline", "offset"]
@@ -62,7 +70,7 @@ class RefineArguments:
     max_depth_m: Positive | None = None
     """Farther points are not used; by default those whose depth noise exceeds 0.35 m."""
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder or katwijk."""
+    """The reader, see jaxmap map --help."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: PosesWorld = "auto"
@@ -83,6 +91,7 @@ class RefineArguments:
     """Camera file in place of the sequence's own."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    bag: BagOptions = field(default_factory=BagOptions)
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631."""
     remap: tuple[str, ...] = ()
@@ -134,6 +143,7 @@ def main(words: Sequence[str]) -> int:
         baseline_unit=arguments.baseline_unit,
         calibration=arguments.calibration,
         camera=arguments.camera,
+        bag=arguments.bag,
         crs=arguments.crs,
         max_pose_gap_s=arguments.max_pose_gap_s,
         start=arguments.start,

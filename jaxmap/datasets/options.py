@@ -21,6 +21,10 @@ QuaternionOrder = Literal["auto", "xyzw", "wxyz"]
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 LengthUnit = Literal["m", "cm", "mm"]
 
+
+Bits = Literal[8, 10, 12, 14, 16]
+"""What cameras deliver; files that hold more than 8 hold 16."""
+
 Offset = Annotated[float, AnyNumber]
 
 
@@ -63,7 +67,7 @@ class ReadOptions:
     """
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder, katwijk, rosbag, madmax, tartanair or middlebury."""
+    """The reader: auto, kitti, euroc, folder, katwijk, planetary, asp, rosbag, madmax, tartanair or middlebury."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: PosesWorld = "auto"
@@ -85,7 +89,10 @@ class ReadOptions:
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
     camera: str | None = None
-    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam; KITTI: grey (the default)
+    or color; planetary archives: navcam, front_hazcam, rear_hazcam, pancam, mastcam, mastcam_z or other."""
+    image_bits: Bits | None = None
+    """Bits that 16-bit images use: 8, 10, 12, 14 or 16; by default found from several images of both cameras."""
     antenna_m: tuple[Offset, Offset, Offset] | None = None
     """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None

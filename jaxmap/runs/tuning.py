@@ -61,7 +61,7 @@ def tuned_config(config: MapConfig, params: TunedParams) -> MapConfig:
     numbers = {name: _rounded(value) for name, value in params.labeller.items()}
     # Relief may stand beside another labeller, whose numbers then come first.
     for section in (config.labeller, "relief"):
-        options = getattr(config, section, None)
+        options: Any = getattr(config, section, None)
         own = {name: numbers.pop(name) for name in list(numbers) if hasattr(options, name)}
         if own:
             config = replace(config, **{section: replace(options, **own)})
