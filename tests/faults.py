@@ -67,10 +67,6 @@ def times_back(scene: Path, folder: Path) -> None:
     rewrite(scene / "times.txt", lambda lines: [*lines[:2], lines[3], lines[2], *lines[4:]])
 
 
-def pose_times_back(scene: Path, folder: Path) -> None:
-    rewrite(scene / "poses.tum", lambda lines: [*lines[:2], lines[3], lines[2], *lines[4:]])
-
-
 def no_times(scene: Path, folder: Path) -> None:
     (scene / "times.txt").unlink()
     rewrite(scene / "poses.tum", lambda lines: lines[:-1])
@@ -80,8 +76,13 @@ def nan_time(scene: Path, folder: Path) -> None:
     rewrite(scene / "times.txt", lambda lines: [*lines[:2], "nan", *lines[3:]])
 
 
-def nan_pose(scene: Path, folder: Path) -> None:
+def worded_pose(scene: Path, folder: Path) -> None:
+    rewrite(scene / "poses.tum", lambda lines: [*lines[:3], re.sub(r" \S+", " 1.o", lines[3], count=1), *lines[4:]])
+
+
+def lost_pose(scene: Path, folder: Path) -> dict[str, object]:
     rewrite(scene / "poses.tum", lambda lines: [*lines[:3], re.sub(r" \S+", " nan", lines[3], count=1), *lines[4:]])
+    return {"strict": True}
 
 
 def long_quaternion(scene: Path, folder: Path) -> None:
@@ -167,10 +168,9 @@ def no_model(scene: Path, folder: Path) -> dict[str, object]:
 SEQUENCE_FAULTS: dict[str, tuple[int, Damage]] = {
     "missing left image": (1, missing_left),
     "times not increasing": (1, times_back),
-    "pose times not increasing": (1, pose_times_back),
     "no times": (1, no_times),
     "NaN time": (1, nan_time),
-    "NaN pose": (1, nan_pose),
+    "pose with a word": (1, worded_pose),
     "quaternion without unit norm": (1, long_quaternion),
     "non-rigid pose": (1, skewed_pose),
     "no poses": (1, no_poses),
@@ -206,6 +206,7 @@ FRAME_FAULTS: dict[str, tuple[int, Damage]] = {
 
 SETTINGS_FAULTS: dict[str, tuple[int, Damage]] = {
     "out of range": (2, with_settings(plane={"threshold_m": -1.0})),
+    "NaN pose, strictly": (1, lost_pose),
     "unknown class": (2, with_settings(plane={"off_plane": "boulder"})),
     "nearest depth beyond the farthest": (2, with_settings(depth={"min_m": 9.0})),
     "odd disparities": (2, with_settings(stereo={"num_disparities": 20})),

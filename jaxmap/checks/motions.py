@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -10,9 +11,8 @@ from jaxtyping import Float32, Float64
 
 from jaxmap.datasets.base import StereoSequence
 from jaxmap.errors import FrameError
-from jaxmap.stereo.align import match_features
-from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
-from jaxmap.stereo.rectify import rectify_image
+from jaxmap.stereo.align import match_features, shrunk_grey
+from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.types import StereoCamera
 
 MIN_DISPARITY_PX = 3.0
@@ -30,7 +30,7 @@ LEAST_PARALLAX = 0.02
 
 LEAST_TURN_DEG = 1.0
 
-PLANE_POINTS, PLANE_HYPOTHESES, PLANE_TOLERANCE, PLANE_SHARE = 1500, 150, 0.02, 0.5
+PLANE_POINTS, PLANE_HYPOTHESES, PLANE_TOLERANCE, PLANE_SHARE = 600, 100, 0.02, 0.5
 """A plane holds half of the points to a 50th of their depth, or it is none."""
 
 
@@ -84,21 +84,26 @@ def choose_steps(T_world_camera: Float64[np.ndarray, "N 4 4"], count: int) -> li
     return [steps[row][:2] for row in rows]
 
 
-def read_left(sequence: StereoSequence, front_end: StereoFrontEnd, index: int) -> np.ndarray | None:
-    """The rectified left image of a frame; None where it cannot be read."""
+def read_shrunk(
+    sequence: StereoSequence, front_end: StereoFrontEnd, index: int, shrink: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The rectified pair of a frame, grey and shrunk so many times; None where it cannot be read."""
     try:
-        left = sequence.read_pair(sequence.frames[index]).left
+        left, right = front_end.rectify(*sequence.read_pair(sequence.frames[index]))
     except FrameError:
         return None
-    return left if front_end.rectifier is None else rectify_image(left, front_end.rectifier.left_maps)
+    return shrunk_grey(left, shrink), shrunk_grey(right, shrink)
 
 
-def read_matched(sequence: StereoSequence, front_end: StereoFrontEnd, index: int) -> RectifiedFrame | None:
-    """A frame rectified and matched; None where it cannot be read."""
-    try:
-        return front_end(*sequence.read_pair(sequence.frames[index]))
-    except FrameError:
-        return None
+def shrunk_camera(camera: StereoCamera, shrink: int) -> StereoCamera:
+    """The camera of images that are shrunk so many times."""
+    return replace(
+        camera,
+        **{name: getattr(camera, name) / shrink for name in ("fx_px", "fy_px", "doffs_px")},
+        **{name: (getattr(camera, name) + 0.5) / shrink - 0.5 for name in ("cx_px", "cy_px")},
+        width_px=camera.width_px // shrink,
+        height_px=camera.height_px // shrink,
+    )
 
 
 def measure_motion(
@@ -107,7 +112,6 @@ def measure_motion(
     left_i: np.ndarray,
     disparity_i_px: Float32[np.ndarray, "H W"],
     left_j: np.ndarray,
-    shrink: int = 1,
 ) -> Motion | None:
     """The motion between two frames: features with depth in the first seen in the second, PnP with RANSAC.
 
@@ -117,12 +121,11 @@ def measure_motion(
         left_i: rectified, of the first frame.
         disparity_i_px: its disparity, NaN where unknown.
         left_j: rectified, of the second.
-        shrink: features are found on images shrunk so many times.
 
     Returns:
         None where too few points agree.
     """
-    matches = match_features(left_i, left_j, shrink)
+    matches = match_features(left_i, left_j)
     points_i, known = _points(camera, disparity_i_px, matches[:, :2])
     points_i, pixels_j = points_i[known], matches[known, 2:]
     if len(points_i) < MIN_INLIERS:
@@ -136,7 +139,7 @@ def measure_motion(
         K,
         None,
         iterationsCount=300,
-        reprojectionError=REPROJECTION_PX * shrink,
+        reprojectionError=REPROJECTION_PX,
         confidence=0.999,
         flags=cv2.SOLVEPNP_SQPNP,
     )

@@ -18,8 +18,8 @@ from jaxmap.checks.motions import (
     choose_steps,
     ground_normal,
     measure_motion,
-    read_left,
-    read_matched,
+    read_shrunk,
+    shrunk_camera,
 )
 from jaxmap.datasets.base import StereoSequence
 from jaxmap.datasets.options import PosesAre
@@ -32,9 +32,10 @@ from jaxmap.datasets.pose_axes import (
     with_other_quaternions,
 )
 from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.match import Matcher, StereoOptions
 
 WIDTH_PX = 600
-"""Features are found on images shrunk to about this width."""
+"""Images are shrunk to about this width."""
 
 FITS_DEG, SUSPECT_DEG = 25.0, 12.0
 """Steps and turns whose directions are off by less fit; those above the second do not where others are far better."""
@@ -111,16 +112,19 @@ def pose_findings(sequence: StereoSequence, front_end: StereoFrontEnd, steps: in
         front_end: its rectification and matcher.
         steps: how many pairs of frames to look at; none leaves what the poses alone say.
     """
-    camera, T_raw_rectified = front_end.camera, front_end.T_raw_rectified
-    shrink = max(1, round(camera.width_px / WIDTH_PX))
+    T_raw_rectified = front_end.T_raw_rectified
+    shrink = max(1, round(front_end.camera.width_px / WIDTH_PX))
+    camera = shrunk_camera(front_end.camera, shrink)
+    matcher = Matcher(StereoOptions(), camera.width_px)
     motions, normals = [], []
     for i, j in choose_steps(sequence.T_world_camera, steps):
-        first, left_j = read_matched(sequence, front_end, i), read_left(sequence, front_end, j)
-        if first is None or left_j is None:
+        pair_i, pair_j = (read_shrunk(sequence, front_end, index, shrink) for index in (i, j))
+        if pair_i is None or pair_j is None:
             continue
-        if (normal := ground_normal(camera, first.disparity_px)) is not None:
+        disparity_px = matcher(*pair_i)
+        if (normal := ground_normal(camera, disparity_px)) is not None:
             normals.append((i, T_raw_rectified[:3, :3] @ normal))
-        motion = measure_motion(camera, (i, j), first.left, first.disparity_px, left_j, shrink)
+        motion = measure_motion(camera, (i, j), pair_i[0], disparity_px, pair_j[0])
         if motion is not None:
             motions.append(motion._replace(T_i_j=T_raw_rectified @ motion.T_i_j @ T_raw_rectified.T))
     left_out = "mend or remove these lines of the pose file"
@@ -183,9 +187,7 @@ def pose_convention(
     gain = max((used.off_deg - best.off_deg) / 45, (used.tilt_deg - best.tilt_deg) / 60)
     certain = min(1.0, gain) * (evidence + 1) / (evidence + 2) * (0.75 if rivals else 1.0)
     read = " and ".join(_WORDS[name][getattr(reading, name)] for name in _changed(reading, best.reading))
-    what = f"the poses, read as {read}, do not fit the images: {_misfit(used, told)}"
-    if used.off_deg > SUSPECT_DEG:
-        what += f", and by {best.off_deg:.0f} if read otherwise"
+    what = f"the poses, read as {read}, do not fit the images: {_misfit(used, told, best)}"
     fix = " or ".join([_options(reading, best.reading), *(_options(reading, rival.reading) for rival in rivals[:2])])
     found = Finding("pose-convention", True, round(float(np.clip(certain, 0.3, 0.99)), 2), what, fix)
     mounting = mounting_findings(best.T_source_camera, told, best.reading)
@@ -251,13 +253,13 @@ def _up(R_world_camera: np.ndarray, positions_m: np.ndarray, normals: Sequence[t
     return upright if steep else max(upright, looks_down)
 
 
-def _misfit(used: _Fit, motions: Sequence[Motion]) -> str:
-    """What is the matter with the reading in use."""
+def _misfit(used: _Fit, motions: Sequence[Motion], best: _Fit | None = None) -> str:
+    """What is the matter with the reading in use, and how much of it is left by the best one."""
     faults = []
     if used.off_deg > SUSPECT_DEG:
-        faults.append(
-            f"the motion of the camera between {len(motions)} pairs of frames is off by {used.off_deg:.0f} degrees"
-        )
+        pairs = f"{len(motions)} pair{'s' * (len(motions) > 1)} of frames"
+        left = f" ({best.off_deg:.0f} if read otherwise)" if best else ""
+        faults.append(f"the motion of the camera between {pairs} is off by {used.off_deg:.0f} degrees{left}")
     if used.up <= UPRIGHT:
         R = T_Z_UP_SOURCE[used.reading.poses_world][:3, :3] @ used.T_source_camera[:, :3, :3]
         up, ahead = -R[:, 2, 1].mean(), R[:, 2, 2].mean()
@@ -291,12 +293,13 @@ def _scale_findings(fit: _Fit, motions: Sequence[Motion], baseline_m: float | No
     unit = next((unit for unit_size, unit in UNITS.items() if 1 / SCALE_FITS < size / unit_size < SCALE_FITS), None)
     long_baseline = baseline_m is not None and baseline_m > LONGEST_BASELINE_M
     by_images = "by the images" if baseline_m is None else f"by the images, with a baseline of {baseline_m:.3g} m,"
-    what = f"steps are {factor:.3g} times as long {by_images} as by the poses"
+    what = f"steps are {factor:,.4g} times as long {by_images} as by the poses"
     if unit is None:
         fix = "check the baseline and the unit of the poses; poses of a single camera have no scale of their own"
     elif factor > 1:
         fix = f"--baseline-unit {unit}" if long_baseline else "check --poses-unit: the positions are too small"
     else:
         fix = f"--poses-unit {unit}"
-    certain = len(factors) / (len(factors) + 1) * (1.0 if unit or size > SCALE_STOPS else 0.6)
-    return [Finding("scale", bool(size > SCALE_STOPS), round(max(certain, 0.5), 2), what, fix)]
+    # One step tells a unit; a scale that is off by less needs several.
+    certain = (len(factors) + 1) / (len(factors) + 1.5) if size > 10 else len(factors) / (len(factors) + 1)
+    return [Finding("scale", bool(size > SCALE_STOPS), round(certain, 2), what, fix)]

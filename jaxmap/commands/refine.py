@@ -108,6 +108,10 @@ class RefineArguments:
     """Frame to stop before, from the end if negative; by default the end."""
     stride: Annotated[int, count(2**31 - 1)] = 1
     """Use every n-th frame."""
+    align: bool = False
+    """Rectify with an estimated rotation of the right camera, as jaxmap map --stereo.align does."""
+    strict: bool = False
+    """Stop where the quick check of the sequence finds something that would make a map wrong."""
     overwrite: bool = False
     """Replace an earlier refinement in the folder; it stays until the new one is whole."""
 
@@ -158,6 +162,8 @@ def main(words: Sequence[str]) -> int:
             _prior(arguments),
             files,
             max_depth_m=arguments.max_depth_m,
+            align=arguments.align,
+            strict=arguments.strict,
             overwrite=arguments.overwrite,
             advance=lambda share, note: advance(round(100 * share), note),
             notify=console.notify,

@@ -30,13 +30,14 @@ from jaxmap.datasets.options import Bits, ReadOptions
 from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE, PoseReading, stand_upright, to_z_up
 from jaxmap.datasets.poses import (
     PoseTrack,
+    in_unit_of_frames,
     poses_at,
     read_poses,
     split_site_origin,
     with_timestamps,
     without_wild_poses,
 )
-from jaxmap.datasets.units import METRES, UNIT_NAMES, unit_that_overlaps, with_baseline_unit
+from jaxmap.datasets.units import METRES, with_baseline_unit
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
@@ -231,6 +232,8 @@ def assemble(
     _check_frames(frames, timestamps_s, camera, where, size_px)
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
+    if options.poses_time_unit == "auto":
+        track = in_unit_of_frames(track, timestamps_s, options.max_pose_gap_s)
     track = without_wild_poses(track)
     assert track.timestamps_s is not None
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
@@ -342,8 +345,6 @@ def _no_pose(timestamps_s: np.ndarray, track: PoseTrack, options: ReadOptions) -
     """No frame has a pose: says so, and which unit of the poses' times would make clocks meet."""
     assert track.timestamps_s is not None
     fix = f"check that both use one clock, or that poses lie within max_pose_gap_s {options.max_pose_gap_s:g} s"
-    if unit := unit_that_overlaps(track.timestamps_s, timestamps_s, track.time_unit):
-        fix = f"they would meet if the poses' times were in {UNIT_NAMES[unit]}: --poses-time-unit {unit}"
     return JaxmapError(
         f"none of {len(timestamps_s)} frames has a pose: the frames span {_span(timestamps_s)}, "
         f"the poses {_span(track.timestamps_s)}",

@@ -13,16 +13,22 @@ MAX_SPEED_M_S, LEAST_JUMP_M = 40.0, 3.0
 MAX_RATE_DEG_S, LEAST_TURN_DEG = 720.0, 60.0
 
 TIMES_TYPICAL = 20.0
-"""A jump is so many times faster than the path is, and half so many times longer than its steps."""
+"""A jump is so many times faster than the path is, and half so many times longer than its steps ..."""
+
+FAST_M_S, FAR_STEP_M, TIMES_FAST = 60.0, 50.0, 2.0
+"""... or exceeds both by so many m/s and m and this factor, on a path that is fast itself."""
 
 IMPOSSIBLE_SPEED_M_S, IMPOSSIBLE_JUMP_M = 100.0, 50.0
-"""Steps above both are jumps, even on a path of two poses."""
+"""A path of two poses is a jump above both."""
 
 FEW_POSES, FEW_SHARE = 5, 0.1
 """A piece of the path beyond a jump is left out if it is shorter than this, as a number or a share of the rest ..."""
 
 FAR_M = 100.0
 """... or if it lies farther away."""
+
+MANY = 0.4
+"""Where a greater share of the poses is off the path, there is no path, and none is left out."""
 
 _CHAINS_SEARCHED = 50
 
@@ -54,11 +60,14 @@ class _Path(NamedTuple):
         """Whether no camera gets from pose i to pose j in that time."""
         length_m, angle_deg, time_s = self.step(i, j)
         speed_m_s = length_m / time_s
-        fast = speed_m_s > max(MAX_SPEED_M_S, TIMES_TYPICAL * self.typical_m_s)
-        far = length_m > max(LEAST_JUMP_M, TIMES_TYPICAL / 2 * self.typical_m)
-        impossible = (speed_m_s > IMPOSSIBLE_SPEED_M_S) & (length_m > IMPOSSIBLE_JUMP_M)
+        fast_m_s = min(TIMES_TYPICAL * self.typical_m_s, FAST_M_S + TIMES_FAST * self.typical_m_s)
+        far_m = min(TIMES_TYPICAL / 2 * self.typical_m, FAR_STEP_M + TIMES_FAST * self.typical_m)
+        leaps = (speed_m_s > max(MAX_SPEED_M_S, fast_m_s)) & (length_m > max(LEAST_JUMP_M, far_m))
+        if len(self.T) == 2:
+            # Nothing is typical of a single step. On longer paths, steps that are all so long are in another unit.
+            leaps |= (speed_m_s > IMPOSSIBLE_SPEED_M_S) & (length_m > IMPOSSIBLE_JUMP_M)
         spins = angle_deg / time_s > max(MAX_RATE_DEG_S, TIMES_TYPICAL * self.typical_deg_s)
-        return (fast & far) | impossible | (spins & (angle_deg > LEAST_TURN_DEG))
+        return leaps | (spins & (angle_deg > LEAST_TURN_DEG))
 
 
 def find_wild_poses(timestamps_s: Float64[np.ndarray, "N"], T: Float64[np.ndarray, "N 4 4"]) -> WildPoses:
@@ -81,7 +90,10 @@ def find_wild_poses(timestamps_s: Float64[np.ndarray, "N"], T: Float64[np.ndarra
     kept = np.flatnonzero(~wild)
     cuts = np.flatnonzero(path.jumps(kept[:-1], kept[1:])) + 1
     chains = _chains(path, np.split(kept, cuts))
-    main = max(chains, key=len)
+    # Of two poses either may be wild: rather the one far from the origin.
+    places = [np.median(T[chain, :3, 3], axis=0) for chain in chains]
+    ranks = [(len(chain), -float(np.linalg.norm(place))) for chain, place in zip(chains, places, strict=True)]
+    main = chains[ranks.index(max(ranks))]
     kept_jump_m = 0.0
     for chain in chains:
         if chain is main:
@@ -92,6 +104,10 @@ def find_wild_poses(timestamps_s: Float64[np.ndarray, "N"], T: Float64[np.ndarra
             wild[chain] = True
         else:
             kept_jump_m = max(kept_jump_m, jump_m)
+    if count > 2 and wild.mean() > MANY:
+        # What so many poses do is no glitch: the path is in another unit, or of another convention.
+        kept_jump_m = max(kept_jump_m, _away(path, wild)[0])
+        wild[:] = False
     return WildPoses(wild, *_away(path, wild), kept_jump_m)
 
 

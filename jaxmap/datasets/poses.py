@@ -19,11 +19,15 @@ from jaxmap.datasets.options import QuaternionOrder, TimeUnit
 from jaxmap.datasets.pose_faults import find_wild_poses
 from jaxmap.datasets.pose_text import left_out, read_pose_text
 from jaxmap.datasets.text_files import data_lines
+from jaxmap.datasets.units import PER_SECOND, UNIT_NAMES
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
 
 KNOT_TOLERANCE_S = 1e-3
 """A time this close to a pose takes it, even beyond the ends of a track and beside gaps."""
+
+FEW_FRAMES, MOST_FRAMES = 0.5, 0.9
+"""Times are in another unit where at most the first share of the frames has a pose, and then more than the second."""
 
 MAX_LOCAL_RANGE_M = 10_000.0
 """Smaller coordinates need no site origin: float32 resolves 1 mm there."""
@@ -289,6 +293,27 @@ def poses_at(
         has_pose &= on_knot | (from_lost_s > KNOT_TOLERANCE_S)
         T[~has_pose] = np.nan
     return T, has_pose
+
+
+def in_unit_of_frames(track: PoseTrack, timestamps_s: Float64[np.ndarray, "M"], max_gap_s: float) -> PoseTrack:
+    """A track with times; in another unit, which a note tells, where only so the times of the frames lie within it.
+
+    Times that do not count from 1970 are too small to tell their unit.
+
+    Args:
+        track: as read from a file, in the unit that was assumed.
+        timestamps_s: of the frames.
+        max_gap_s: poses farther apart are not interpolated.
+    """
+    knots_s = _knots_s(track)
+    if len(timestamps_s) < 2 or poses_at(track, timestamps_s, max_gap_s)[1].mean() > FEW_FRAMES:
+        return track
+    for unit, per_second in PER_SECOND.items():
+        other = replace(track, timestamps_s=knots_s * (PER_SECOND[track.time_unit] / per_second), time_unit=unit)
+        if unit != track.time_unit and poses_at(other, timestamps_s, max_gap_s)[1].mean() > MOST_FRAMES:
+            note = f"times of the poses are taken for {UNIT_NAMES[unit]}, as those of the frames lie among them so"
+            return replace(other, notes=(*track.notes, note))
+    return track
 
 
 def split_site_origin(

@@ -32,18 +32,3 @@ def with_baseline_unit(camera: StereoCamera | StereoRig, unit: LengthUnit) -> St
     if isinstance(camera, StereoRig):
         return replace(camera, t_right_left_m=camera.t_right_left_m * METRES[unit])
     return replace(camera, baseline_m=camera.baseline_m * np.float32(METRES[unit]))
-
-
-def unit_that_overlaps(times_s: np.ndarray, others_s: np.ndarray, unit: TimeUnit) -> TimeUnit | None:
-    """The unit of some times under which their span meets that of others; None where no other unit does.
-
-    Args:
-        times_s: (N,), the times as read in `unit`.
-        others_s: (M,), times of the same clock that are right.
-        unit: the unit that `times_s` were taken for.
-    """
-    for other, per_second in PER_SECOND.items():
-        scaled_s = times_s * (PER_SECOND[unit] / per_second)
-        if other != unit and scaled_s.min() <= others_s.max() and scaled_s.max() >= others_s.min():
-            return other
-    return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,7 +38,8 @@ class MapConfig(ReadOptions):
     the names that deeplab.class_map gives or, without any, all classes of the network. Points of its other
     classes are mapped without a class. Each class takes as much memory as the occupancy."""
     strict: bool = False
-    """Stop at the first unusable frame instead of going on without it."""
+    """Stop where the quick check of the sequence finds something that makes the map wrong, and at the first unusable
+    frame, instead of going on with a note."""
     seed: Annotated[int, Seed] = 0
     """Seed of all randomness."""
     grid: GridOptions = field(default_factory=GridOptions)
@@ -49,6 +50,18 @@ class MapConfig(ReadOptions):
     relief: ReliefOptions = field(default_factory=ReliefOptions)
     deeplab: DeeplabOptions = field(default_factory=DeeplabOptions)
     ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
+
+
+@options("")
+class CheckConfig(ReadOptions):
+    """What decides how a sequence is read and matched."""
+
+    stereo: StereoOptions = field(default_factory=StereoOptions)
+
+    @classmethod
+    def of(cls, config: MapConfig) -> CheckConfig:
+        """Those settings of a map."""
+        return cls(**{one.name: getattr(config, one.name) for one in fields(cls)})
 
 
 _SETTINGS = Settings(MapConfig, "map", given=("sequence",))

@@ -14,6 +14,8 @@ from jaxmap.evaluation.geometry_scores import DisparityScores
 from jaxmap.mapping.sequence import FusedFrame
 
 MOST_KEPT = 2048
+TOO_NEAR_SHARE = 0.01
+"""A frame is counted where more than this share of it is nearer than can be seen."""
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -67,6 +69,8 @@ class RunLog:
         valid_fractions: share of a frame's pixels that have a disparity.
         points_fused: points that the labeller kept.
         without_ground: frames in which the labeller found no ground below the camera; None where it looks for none.
+        too_near: frames of which more than a hundredth was left out as nearer than the searched disparities reach.
+        nearest_px: the greatest disparity of what was left out so.
         disparity: scores of the disparity of frames whose truth is known, by name.
         total_s: time spent on frames.
         compile_s: time spent on compiling.
@@ -84,6 +88,8 @@ class RunLog:
     valid_fractions: Sample = field(default_factory=Sample)
     points_fused: Count = 0
     without_ground: Count | None = None
+    too_near: Count = 0
+    nearest_px: Number = 0.0
     disparity: dict[str, Sample] = field(default_factory=dict)
     total_s: Seconds = 0.0
     compile_s: Seconds = 0.0
@@ -101,7 +107,12 @@ class RunLog:
         self.fused += 1
         for name, seconds in prepared.stages_s.items():
             self.stages_ms.setdefault(name, Sample()).add(round(1e3 * seconds, 3))
-        pixels = prepared.rectified.disparity_px.size if prepared.rectified is not None else 1
+        pixels = 1
+        if (rectified := prepared.rectified) is not None:
+            pixels = rectified.disparity_px.size
+            if rectified.too_near > TOO_NEAR_SHARE:
+                self.too_near += 1
+                self.nearest_px = max(self.nearest_px, rectified.nearest_px)
         self.valid_fractions.add(round(int(fused.info.points_valid) / pixels, 4))
         self.points_fused += int(fused.info.points_kept)
         # Of the plane labeller as of those that see relief.

@@ -18,10 +18,14 @@ from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, r
 from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
+from jaxmap.runs.checking import finding_line, findings_tree
 from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Notify, Plan
 from jaxmap.types import VoxelMap
+
+FEW_MATCHED = 0.01
+"""Where fewer pixels of a frame have a depth in range, it is not the bounds that leave a map empty."""
 
 
 def run_plan(
@@ -110,7 +114,7 @@ def run_plan(
     metrics = _write_outputs(plan, folder, log, voxel_map, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
-    for note in _notes(log, metrics):
+    for note in _notes(plan, log, metrics):
         notify(f"note: {note}")
     return metrics
 
@@ -145,8 +149,16 @@ def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
     return score_disparity(rectified.disparity_px, truth_px)
 
 
-def _notes(log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
+def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
+    said = {finding.kind for finding in plan.findings}
+    if log.too_near and not said & {"near-limit", "vertical-disparity"}:
+        matcher = plan.front_end.matcher
+        needed = -(-(log.nearest_px + 1 - matcher.options.min_disparity_px) // 16) * 16
+        yield (
+            f"in {log.too_near} of {log.fused} frames something is nearer than {matcher.num_disparities} disparities "
+            f"can see, and was left out: the map has a hole there; --stereo.num-disparities {needed:.0f} sees it"
+        )
     if scores := metrics.get("disparity"):
         yield (
             f"against the true disparity: median error {scores['median_error_px']:.2f} px, {scores['bad_2']:.1%} off "
@@ -158,7 +170,11 @@ def _notes(log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
             "by its shape; check that the poses are of the left camera in a z-up world"
         )
     if not metrics["voxels"]["occupied"]:
-        yield "no voxel is occupied: check the bounds, the range and the poses"
+        matched = log.valid_fractions.percentile(50)
+        reason = "check the bounds, the range and the poses"
+        if matched < FEW_MATCHED:
+            reason = f"only {matched:.1%} of the pixels lie in range; jaxmap check tells what is wrong with the images"
+        yield f"no voxel is occupied: {reason}"
 
 
 def _write_outputs(
@@ -262,13 +278,15 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "crs": sequence.crs,
             "site_origin": sequence.site_origin.tolist(),
             "path_length_m": round(float(steps_m.sum()), 3),
-            "notes": list(sequence.notes),
+            "notes": [*sequence.notes, *map(finding_line, plan.findings)],
+            **({"findings": findings_tree(plan.findings)} if plan.findings else {}),
         },
         "camera": camera_numbers
         | {
             "width_px": camera.width_px,
             "height_px": camera.height_px,
             "rectified_here": plan.front_end.rectifier is not None,
+            **({} if (turn := plan.front_end.alignment_rad) is None else {"alignment_rad": turn.round(8).tolist()}),
             # Poses of the rectified camera, relative to the site origin.
             "key_frames": {
                 f"{index:06d}": (sequence.T_world_camera[index] @ plan.front_end.T_raw_rectified).round(6).tolist()
@@ -292,6 +310,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
         "points": {
             "valid_fraction": round(log.valid_fractions.percentile(50), 4),
             "fused": log.points_fused,
+            **({"frames_too_near": log.too_near} if log.too_near else {}),
         },
         **(
             {"disparity": {name: round(sample.total / sample.count, 4) for name, sample in log.disparity.items()}}

@@ -13,6 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from jaxmap.checks.check import open_front_end
+from jaxmap.checks.finding import Finding
 from jaxmap.datasets import StereoSequence, open_sequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
@@ -33,6 +35,7 @@ from jaxmap.mapping.sequence import frame_form
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.tensor_files import shortened
+from jaxmap.runs.checking import warn_of_faults
 from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.rectify import StereoRig
@@ -255,6 +258,8 @@ class Plan:
     key: PRNGKeyArray
     pose_errors: Float[np.ndarray, "N M 6"] | None = None
     """Of the members of an ensemble, for each frame."""
+    findings: tuple[Finding, ...] = ()
+    """What the quick check of the sequence has found."""
 
     @property
     def members(self) -> int:
@@ -287,6 +292,8 @@ class Plan:
         frames = self.sequence.frames[:count]
         described = [(frame.name, frame.timestamp_s) for frame in frames]
         camera = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(self.front_end.camera)]
+        if (alignment_rad := self.front_end.alignment_rad) is not None:
+            camera.append(alignment_rad.tolist())
         poses = np.ascontiguousarray(self.sequence.T_world_camera[:count])
         return hashlib.sha256(repr((described, camera)).encode() + poses.tobytes()).hexdigest()[:16]
 
@@ -305,9 +312,13 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
     sequence = open_sequence(source, config)
     if config.strict and sequence.pose_faults:
         raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
-    front_end = StereoFrontEnd(sequence.camera, config.stereo)
+    front_end = open_front_end(sequence, config.stereo, notify)
     camera = front_end.camera
     _describe_sequence(sequence, camera, notify)
+    findings: tuple[Finding, ...] = ()
+    # The bundled samples are as they should be, unless other poses or another camera are put to them.
+    if not source.startswith(SAMPLE_PREFIX) or config.poses or config.calibration:
+        findings = warn_of_faults(sequence, front_end, strict=config.strict, notify=notify)
     depth_range_m = _depth_range(config, camera)
     label_folder = choose_label_folder(config, sequence)
     model, network = choose_model(config)
@@ -351,6 +362,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         ),
         key=key,
         pose_errors=pose_errors,
+        findings=findings,
     )
 
 

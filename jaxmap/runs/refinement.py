@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import map_coordinates
 
+from jaxmap.checks.check import open_front_end
+from jaxmap.checks.finding import Finding
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.calibration import write_camera_yaml
 from jaxmap.datasets.crs import Extent, transform_between
@@ -31,6 +33,7 @@ from jaxmap.refinement.ground import GroundRaster
 from jaxmap.refinement.refine import GroundReference, Refinement, refine, results
 from jaxmap.refinement.solver import Prior
 from jaxmap.report.refine_page import write_refine_report
+from jaxmap.runs.checking import finding_line, warn_of_faults
 from jaxmap.runs.evaluation import TruthOptions, read_truth
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
@@ -76,6 +79,8 @@ def run_refine(
     files: GroundFiles,
     *,
     max_depth_m: float | None = None,
+    align: bool = False,
+    strict: bool = False,
     overwrite: bool = False,
     advance: Advance = lambda done, note: None,
     notify: Notify = lambda line: None,
@@ -89,6 +94,8 @@ def run_refine(
         prior: what may be wrong, and by how much.
         files: what is known of the ground.
         max_depth_m: farther points are not used; by default where depth noise reaches `DEPTH_SIGMA_M`.
+        align: rectify with an estimated correction, as jaxmap map --stereo.align does.
+        strict: stop where the quick check of the sequence finds what makes a map wrong.
         overwrite: replace an earlier refinement in the folder.
         advance: reports progress.
         notify: takes lines for the user.
@@ -103,9 +110,7 @@ def run_refine(
     replacement.settle_for_reading()
     check_replaceable(out, overwrite=overwrite)
     with locked(out), replacement.place(RESULTS, notify) as work:
-        inputs = read_inputs(source, options, advance)
-        for note in inputs.sequence.notes:
-            notify(f"note: {note}")
+        inputs = read_inputs(source, options, advance, notify, align=align, strict=strict)
         started_s = time.perf_counter()
         sequence, camera = inputs.sequence, inputs.front_end.camera
         depth_range_m = (0.3, max_depth_m or max(usable_depth(camera, DEPTH_SIGMA_M, 0.5), 0.5))
@@ -117,7 +122,7 @@ def run_refine(
             content.update(results(state, inputs.T_world_camera, prior))
             content["frames"] = [frame.name for frame in sequence.frames]
             content["skipped"] = inputs.skipped
-            content["notes"] = [*notes, *state.notes]
+            content["notes"] = [*map(finding_line, inputs.findings), *notes, *state.notes]
             content["seconds"] = round(inputs.seconds + time.perf_counter() - started_s, 1)
             write_json(work / RESULTS, content)
             _write_poses(work, state, inputs, prior)
@@ -184,6 +189,7 @@ class RefineInputs:
         frames: one for each frame of the sequence.
         skipped: names of the other frames, with the reason.
         seconds: that reading took.
+        findings: of the quick check.
     """
 
     sequence: StereoSequence
@@ -191,6 +197,7 @@ class RefineInputs:
     frames: list[DisparityFrame]
     skipped: list[dict[str, str]]
     seconds: float = 0.0
+    findings: tuple[Finding, ...] = ()
 
     @property
     def T_world_camera(self) -> Float64[np.ndarray, "N 4 4"]:
@@ -198,15 +205,26 @@ class RefineInputs:
         return self.sequence.T_world_camera @ self.front_end.T_raw_rectified
 
 
-def read_inputs(source: str, options: ReadOptions, advance: Advance = lambda done, note: None) -> RefineInputs:
-    """Reads and matches a sequence.
+def read_inputs(
+    source: str,
+    options: ReadOptions,
+    advance: Advance = lambda done, note: None,
+    notify: Notify = lambda line: None,
+    *,
+    align: bool = False,
+    strict: bool = False,
+) -> RefineInputs:
+    """Reads, checks and matches a sequence.
 
     Raises:
-        JaxmapError: the sequence cannot be read, or fewer than two of its frames can.
+        JaxmapError: the sequence cannot be read, fewer than two of its frames can, or the check stops it (`strict`).
     """
     started_s = time.perf_counter()
     sequence = open_sequence(source, options)
-    front_end = StereoFrontEnd(sequence.camera, StereoOptions())
+    for note in sequence.notes:
+        notify(f"note: {note}")
+    front_end = open_front_end(sequence, StereoOptions(align=align), notify)
+    findings = warn_of_faults(sequence, front_end, strict=strict, notify=notify)
     used: list[DisparityFrame] = []
     kept: list[int] = []
     skipped: list[dict[str, str]] = []
@@ -239,7 +257,7 @@ def read_inputs(source: str, options: ReadOptions, advance: Advance = lambda don
         )
     frames = tuple(sequence.frames[index] for index in kept)
     sequence = replace(sequence, frames=frames, T_world_camera=sequence.T_world_camera[kept])
-    return RefineInputs(sequence, front_end, used, skipped, time.perf_counter() - started_s)
+    return RefineInputs(sequence, front_end, used, skipped, time.perf_counter() - started_s, findings)
 
 
 def read_ground(files: GroundFiles, inputs: RefineInputs, max_depth_m: float) -> tuple[GroundReference, list[str]]:

@@ -18,6 +18,7 @@ from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import write_json, write_yaml
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.report.tuning_page import tuning_page
+from jaxmap.runs.checking import finding_line
 from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
@@ -278,7 +279,14 @@ class TuningRun:
             "traverses": self._describe_traverses(),
             "before": plain(before),
             "stages": [stage.record for stage in stages],
-            "notes": [note for stage in stages for note in descent_notes(stage.record)],
+            "notes": [
+                *(
+                    f"{plan.sequence.name}: {finding_line(finding)}"
+                    for plan in self._plans
+                    for finding in plan.findings
+                ),
+                *(note for stage in stages for note in descent_notes(stage.record)),
+            ],
         }
         write_json(self._out.with_suffix(".json"), result)
         with atomic_path(self._out.with_suffix(".html")) as temporary:

@@ -46,7 +46,7 @@ def match_features(left: np.ndarray, right: np.ndarray, shrink: int = 1) -> Floa
     """
     # Sand has little contrast: OpenCV's threshold would leave a few features on it.
     detector = cv2.SIFT.create(FEATURES, contrastThreshold=0.01)
-    found = [detector.detectAndCompute(_shrunk_grey(image, shrink), None) for image in (left, right)]  # type: ignore[call-overload]
+    found = [detector.detectAndCompute(shrunk_grey(image, shrink), None) for image in (left, right)]  # type: ignore[call-overload]
     if any(len(points) < 2 for points, _ in found):
         return np.zeros((0, 4))
     (points_left, descriptors_left), (points_right, descriptors_right) = found
@@ -64,7 +64,8 @@ def match_features(left: np.ndarray, right: np.ndarray, shrink: int = 1) -> Floa
     return (both + 0.5) * shrink - 0.5
 
 
-def _shrunk_grey(image: np.ndarray, shrink: int) -> np.ndarray:
+def shrunk_grey(image: np.ndarray, shrink: int) -> np.ndarray:
+    """An image, grey or RGB, as grey and shrunk so many times; what is left of a whole pixel at its edges goes."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     if shrink == 1:
         return grey

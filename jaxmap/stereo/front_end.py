@@ -4,24 +4,38 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
+from jaxmap.stereo.align import alignment_homography, estimate_alignment, match_features
+from jaxmap.stereo.blank import blank_reason
 from jaxmap.stereo.match import Matcher, StereoOptions
+from jaxmap.stereo.near import NearGuard
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
 from jaxmap.types import StereoCamera
 
+_BLANK_FIX = "take the frame out, or choose others with --start, --stop and --stride"
+
 
 class RectifiedFrame(NamedTuple):
-    """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages."""
+    """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
+
+    `too_near` is the share of pixels that were left out because they are nearer than the searched disparities reach,
+    and `nearest_px` the disparity of the nearest of them.
+    """
 
     left: np.ndarray
     right: np.ndarray
     disparity_px: np.ndarray
     rectify_s: float
     match_s: float
+    too_near: float = 0.0
+    nearest_px: float = 0.0
 
 
 class StereoFrontEnd:
@@ -30,9 +44,15 @@ class StereoFrontEnd:
     Attributes:
         camera: the rectified camera.
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
+        alignment_rad: rotation vector by which the rectified right camera is corrected, or None.
     """
 
-    def __init__(self, camera: StereoCamera | StereoRig, options: StereoOptions) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera | StereoRig,
+        options: StereoOptions,
+        alignment_rad: Float64[np.ndarray, "3"] | None = None,
+    ) -> None:
         """Prepares the look-up maps and the matcher.
 
         Raises:
@@ -41,12 +61,18 @@ class StereoFrontEnd:
         """
         self.rectifier: Rectifier | None = None
         self.T_raw_rectified = np.eye(4)
+        self.alignment_rad = alignment_rad
+        self._right_homography: np.ndarray | None = None
         if isinstance(camera, StereoRig):
-            self.rectifier = make_rectifier(camera, options.alpha)
+            R_aligned = None if alignment_rad is None else Rotation.from_rotvec(alignment_rad).as_matrix()
+            self.rectifier = make_rectifier(camera, options.alpha, R_aligned)
             self.T_raw_rectified[:3, :3] = self.rectifier.R_rectified_left.T
             camera = self.rectifier.camera
+        elif alignment_rad is not None:
+            self._right_homography = alignment_homography(camera, alignment_rad)
         self.camera: StereoCamera = camera
         self.matcher = Matcher(options, camera.width_px)
+        self._near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> RectifiedFrame:
         """Rectifies and matches one pair.
@@ -56,8 +82,42 @@ class StereoFrontEnd:
             right: likewise.
 
         Raises:
+            FrameError: the sizes disagree with each other or with the calibration, or an image shows nothing.
+        """
+        stages_s: dict[str, float] = {}
+        self._check_sizes(left, right)
+        with timed_stage("rectify", stages_s):
+            for side, image in (("left", left), ("right", right)):
+                if (reason := blank_reason(image)) is not None:
+                    raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
+            left, right = self.rectify(left, right)
+        with timed_stage("match", stages_s):
+            disparity_px = self.matcher(left, right)
+            if self.rectifier is not None:
+                disparity_px[~self.rectifier.seen] = np.nan
+            near = None if self._near_guard is None else self._near_guard(left, right)
+            if near is not None:
+                disparity_px[near.pixels] = np.nan
+        times_s = stages_s["rectify"], stages_s["match"]
+        if near is None:
+            return RectifiedFrame(left, right, disparity_px, *times_s)
+        return RectifiedFrame(left, right, disparity_px, *times_s, float(near.pixels.mean()), near.disparity_px)
+
+    def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The rectified pair; the images as they are where nothing is to be done.
+
+        Raises:
             FrameError: the sizes disagree with each other or with the calibration.
         """
+        self._check_sizes(left, right)
+        if self.rectifier is not None:
+            return rectify_image(left, self.rectifier.left_maps), rectify_image(right, self.rectifier.right_maps)
+        if self._right_homography is not None:
+            size_px = (self.camera.width_px, self.camera.height_px)
+            right = cv2.warpPerspective(right, self._right_homography, size_px, flags=cv2.INTER_LINEAR)
+        return left, right
+
+    def _check_sizes(self, left: np.ndarray, right: np.ndarray) -> None:
         expected = (self.camera.height_px, self.camera.width_px)
         for side, image in (("left", left), ("right", right)):
             if image.shape[:2] != expected:
@@ -66,16 +126,6 @@ class StereoFrontEnd:
                     f"{expected[1]}x{expected[0]} px",
                     fix="give the calibration of these images",
                 )
-        stages_s: dict[str, float] = {}
-        with timed_stage("rectify", stages_s):
-            if self.rectifier is not None:
-                left = rectify_image(left, self.rectifier.left_maps)
-                right = rectify_image(right, self.rectifier.right_maps)
-        with timed_stage("match", stages_s):
-            disparity_px = self.matcher(left, right)
-            if self.rectifier is not None:
-                disparity_px[~self.rectifier.seen] = np.nan
-        return RectifiedFrame(left, right, disparity_px, stages_s["rectify"], stages_s["match"])
 
     def check_order(self, frame: RectifiedFrame, where: object = "") -> None:
         """Rejects a pair whose left and right images are swapped.
@@ -83,13 +133,21 @@ class StereoFrontEnd:
         Raises:
             JaxmapError: the pair matches far better the other way round.
         """
-        if self.matcher.looks_swapped(frame.left, frame.right, frame.disparity_px):
+        if self._looks_swapped(frame):
             valid = np.isfinite(frame.disparity_px).mean()
             raise JaxmapError(
                 f"left and right look swapped: {valid:.0%} of the disparities are valid, far more the other way round",
                 where=where,
                 fix="swap the two folders or cameras",
             )
+
+    def _looks_swapped(self, frame: RectifiedFrame) -> bool:
+        """Whether the pair matches far better the other way round, unless its features say that it does not."""
+        if not self.matcher.looks_swapped(frame.left, frame.right, frame.disparity_px):
+            return False
+        # What is nearer than the matcher sees has few true matches either way.
+        found = estimate_alignment(self.camera, match_features(frame.left, frame.right))
+        return found is None or found.inliers.mean() < 0.5 or float(np.median(found.disparity_px[found.inliers])) < 0
 
     def rectify_labels(self, labels: np.ndarray) -> np.ndarray:
         """Label image (H, W) or probabilities (H, W, C) of the raw left image, rectified.

@@ -29,6 +29,9 @@ class StereoOptions:
 
     alpha: Annotated[float, Interval(ge=-1, le=1)] = 0.0
     """Rectification: 0 keeps only pixels valid in both images, 1 keeps all, -1 lets OpenCV choose."""
+    align: bool = False
+    """Estimate a rotation of the right camera under which the rows of both images agree, from matches in some frames,
+    and rectify all frames with it: for a calibration that is slightly off (`jaxmap check` says so)."""
     mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
     min_disparity_px: Annotated[int, count(1024, least=-1024)] = 0
@@ -60,6 +63,8 @@ class StereoOptions:
     """Edge of the square, odd, that is near."""
     pad_left: bool = True
     """Match the leftmost columns too."""
+    near_guard: bool = True
+    """Leave out what is too near for the disparities searched, instead of taking false matches there."""
 
     def __post_init__(self) -> None:
         if self.min_disparity_px + (self.num_disparities or 0) > _MOST_DISPARITIES:

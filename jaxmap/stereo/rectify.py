@@ -114,12 +114,13 @@ class Rectifier(NamedTuple):
     seen: np.ndarray
 
 
-def make_rectifier(rig: StereoRig, alpha: float = 0.0) -> Rectifier:
+def make_rectifier(rig: StereoRig, alpha: float = 0.0, R_aligned: np.ndarray | None = None) -> Rectifier:
     """Rectification after Bouguet (`cv2.stereoRectify`), principal points aligned.
 
     Args:
         rig: the raw calibration.
         alpha: 0 keeps only pixels valid in both images, 1 keeps them all, -1 lets OpenCV choose.
+        R_aligned: (3, 3), a correction of the rectified right camera's rays (`align.estimate_alignment`).
 
     Raises:
         JaxmapError: the right camera is not to the right of the left one.
@@ -156,6 +157,8 @@ def make_rectifier(rig: StereoRig, alpha: float = 0.0) -> Rectifier:
         height_px=rig.height_px,
         where="calibration (left and right swapped?)",
     )
+    if R_aligned is not None:
+        R_right = R_aligned @ R_right
     # Fixed-point maps: half the memory traffic of float ones, 1/32 px.
     left = undistorted(rig.K_left, rig.distortion_left, R_left, P_left, size, cv2.CV_16SC2)
     right = undistorted(rig.K_right, rig.distortion_right, R_right, P_right, size, cv2.CV_16SC2)

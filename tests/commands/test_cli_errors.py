@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from faults import all_unreadable, nan_pose, truncated
+from faults import all_unreadable, truncated, worded_pose
 from fixtures import (
     cli,  # noqa: F401
     finished_run,  # noqa: F401
@@ -88,7 +88,7 @@ def trained(given: Given, fault: str, *words: object) -> list[object]:
 
 FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "unknown command": (2, lambda given: ["mapp"]),
-    "map: NaN pose": (1, lambda given: mapped(given, damage=nan_pose)),
+    "map: pose with a word": (1, lambda given: mapped(given, damage=worded_pose)),
     "map: truncated image, strictly": (1, lambda given: mapped(given, "--strict", damage=truncated)),
     "map: all frames unreadable": (1, lambda given: mapped(given, damage=all_unreadable)),
     "map: out lies in a file": (1, lambda given: ["map", given.scene, "--out", below_a_file(given)]),
@@ -199,7 +199,7 @@ def test_a_faulty_frame_is_reported_and_skipped_unless_strict(cli, scene_copy, t
 def test_a_faulty_input_leaves_the_run_that_is_there(cli, scene_copy, finished_run, tmp_path):
     run = Path(shutil.copytree(finished_run, tmp_path / "run"))
     before = files_of(run)
-    nan_pose(scene_copy, tmp_path)
+    worded_pose(scene_copy, tmp_path)
     for words in (("--overwrite",), ("--resume",), ("--overwrite", "--grid.max-memory-gib", "1e-4")):
         assert cli(*map_words(scene_copy, run, *words)).status == 1
     assert files_of(run) == before

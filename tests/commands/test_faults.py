@@ -38,7 +38,8 @@ NAMED = {
     "left and right of different size": "f000",
     "label of another size": "f000.png",
     "missing right image": "f002.png",
-    "NaN pose": "line 4",
+    "pose with a word": "line 4",
+    "NaN pose, strictly": "line 4",
 }
 """What an error must name."""
 

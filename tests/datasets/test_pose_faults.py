@@ -42,8 +42,8 @@ def test_a_drive_has_no_wild_pose(path):
 def test_one_pose_far_away_is_found_and_no_other(path, place, away_m):
     times_s, T = path
     place %= len(T)
-    if len(T) == 2:
-        place = 1
+    # Of two poses the one far from the origin is wild.
+    T[:, :3, 3] -= T[0, :3, 3]
     T[place, :3, 3] += [away_m, -away_m, 0]
     found = find_wild_poses(times_s, T)
     assert np.flatnonzero(found.wild).tolist() == [place]
@@ -92,3 +92,17 @@ def test_a_wild_pose_is_taken_out_of_a_track_with_a_fault_that_names_its_line():
     track = without_wild_poses(make_pose_track(np.array([0.0, 0.1]), T, where="a/poses.tum", lines=[3, 4]))
     assert track.usable.tolist() == [True, False]
     assert track.faults == ("poses.tum: 1 of 2 poses off the path by up to 12034 m and 0 deg (line 4) is left out",)
+
+
+@given(path=paths, factor=st.sampled_from([100.0, 1000.0]))
+def test_a_path_in_another_unit_is_not_wild(path, factor):
+    times_s, T = path
+    T[:, :3, 3] = factor * (T[:, :3, 3] - T[0, :3, 3])
+    if len(T) > 2:
+        assert find_wild_poses(times_s, T).wild.mean() < 0.5
+
+
+def test_of_two_poses_the_far_one_is_wild():
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[:, :3, 3] = (9e3, 0, 0), (1, 2, 0)
+    assert find_wild_poses(np.array([0.0, 0.1]), T).wild.tolist() == [True, False]

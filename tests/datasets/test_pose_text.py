@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from jaxmap.datasets.base import read_pose_track
 from jaxmap.datasets.options import ReadOptions
-from jaxmap.datasets.poses import poses_at, read_poses
-from jaxmap.datasets.units import unit_by_size, unit_that_overlaps
+from jaxmap.datasets.poses import in_unit_of_frames, poses_at, read_poses
+from jaxmap.datasets.units import unit_by_size
 from jaxmap.errors import JaxmapError
 
 HALF = 0.5**0.5
@@ -139,7 +139,16 @@ def test_a_csv_of_a_body_is_taken_for_the_camera_where_it_stands_upright_or_is_t
 def test_units_of_unix_times_are_known_by_size(seconds, unit):
     per_second = {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
     assert (unit_by_size(seconds * per_second) or "s") == unit
-    assert unit_that_overlaps(np.array([seconds * per_second]), np.array([0.0, 1e10]), "s") in (
-        None if unit == "s" else unit,
-        *({"ms", "us", "ns"} if unit == "s" else {}),
-    )
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_small_times_are_taken_in_the_unit_that_puts_the_frames_among_them(tmp_path, unit):
+    per_second = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9}[unit]
+    path = tmp_path / "poses.txt"
+    path.write_text("".join(f"{second * per_second // 2} {second} 0 0 0 0 0 1\n" for second in range(7)))
+    frames_s = np.array([0.0, 0.5, 1.25, 3.0])
+    track = in_unit_of_frames(read_poses(path), frames_s, max_gap_s=1.0)
+    np.testing.assert_allclose(poses_at(track, frames_s, 1.0)[0][:, 0, 3], 2 * frames_s)
+    assert track.time_unit == unit
+    assert len(track.notes) == (unit != "s")
+    assert in_unit_of_frames(track, frames_s + 1e6, max_gap_s=1.0) is track
