@@ -44,13 +44,15 @@ def check_bounds(arguments: object, command: str) -> None:
     """
     from pydantic import TypeAdapter, ValidationError
 
+    from jaxmap.host.settings import fault_text
+
     try:
         TypeAdapter(type(arguments)).validate_python(vars(arguments))
     except ValidationError as error:
         faults = []
         for fault in error.errors():
-            option, message = str(fault["loc"][0]).replace("_", "-"), fault["msg"]
-            faults.append(f"--{option} is {fault['input']}: {message[0].lower()}{message[1:]}")
+            option = str(fault["loc"][0]).replace("_", "-")
+            faults.append(f"--{option} is {str(fault['input'])[:60]}: {fault_text(fault['msg'])}")
         raise UsageError("; ".join(faults), fix=f"see jaxmap {command} --help") from error
 
 

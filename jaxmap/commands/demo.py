@@ -94,13 +94,15 @@ def _map_and_score(out: Path, name: str, config: MapConfig, truth: Path, console
 
     folder = RunFolder(out)
     plan = plan_run(SAMPLE, config, console.notify)
-    with folder.locked():
-        folder.begin(plan.settings(config), resume=False, overwrite=True)
-        metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify, report=False)
-    evaluation, layer = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
-    backdrop = read_backdrop(truth / "orthomosaic.tif", evaluation, layer)
-    write_evaluation(folder.scores, folder.errors, evaluation, backdrop)
-    write_report(out)
+    with folder.locked(), folder.writing(plan.settings(config), resume=False, overwrite=True) as work:
+        metrics = run_plan(plan, work, strict=True, checkpoint_every_s=60.0, notify=console.notify, report=False)
+        evaluation, layer = evaluate_run(
+            work.path, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions()
+        )
+        evaluation.scores["run"] = str(out)
+        backdrop = read_backdrop(truth / "orthomosaic.tif", evaluation, layer)
+        write_evaluation(work.scores, work.errors, evaluation, backdrop)
+        write_report(work.path)
     row = {**evaluation.scores, **found_rocks(evaluation.scores["rocks"]), **_figures(metrics)}
     return ScoredRun({**row, "run": out.name, "map": name}, evaluation, backdrop)
 

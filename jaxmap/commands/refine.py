@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,10 +13,19 @@ import tyro
 from annotated_types import Interval, MinLen
 
 from jaxmap.commands.console import Console, check_bounds, parse
-from jaxmap.datasets.options import LengthUnit, PoseConvention, PosesAre, PosesWorld, QuaternionOrder, TimeUnit
+from jaxmap.datasets.options import (
+    BagOptions,
+    LengthUnit,
+    PoseConvention,
+    PosesAre,
+    PosesWorld,
+    QuaternionOrder,
+    TimeUnit,
+)
+from jaxmap.host.settings import Place, count
 
 Adjustable = Literal["poses", "mounting", "baseline", "offset"]
-Positive = Annotated[float, Interval(gt=0, lt=1e4)]
+Positive = Annotated[float, Interval(ge=1e-9, lt=1e4)]
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,7 @@ class RefineArguments:
     max_depth_m: Positive | None = None
     """Farther points are not used; by default those whose depth noise exceeds 0.35 m."""
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder or katwijk."""
+    """The reader, see jaxmap map --help."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
     poses_world: PosesWorld = "auto"
@@ -82,6 +91,7 @@ class RefineArguments:
     """Camera file in place of the sequence's own."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    bag: BagOptions = field(default_factory=BagOptions)
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631."""
     remap: tuple[str, ...] = ()
@@ -92,18 +102,18 @@ class RefineArguments:
     """Coordinate reference system of the ground truth, in place of its own."""
     max_pose_gap_s: Positive = 1.0
     """Poses farther apart are not interpolated."""
-    start: int = 0
+    start: Annotated[int, Place] = 0
     """First frame."""
-    stop: int | None = None
+    stop: Annotated[int, Place] | None = None
     """Frame to stop before, from the end if negative; by default the end."""
-    stride: int = 1
+    stride: Annotated[int, count(2**31 - 1)] = 1
     """Use every n-th frame."""
     align: bool = False
     """Rectify with an estimated rotation of the right camera, as jaxmap map --stereo.align does."""
     strict: bool = False
     """Stop where the quick check of the sequence finds something that would make a map wrong."""
     overwrite: bool = False
-    """Replace an earlier refinement in the folder."""
+    """Replace an earlier refinement in the folder; it stays until the new one is whole."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -133,6 +143,7 @@ def main(words: Sequence[str]) -> int:
         baseline_unit=arguments.baseline_unit,
         calibration=arguments.calibration,
         camera=arguments.camera,
+        bag=arguments.bag,
         crs=arguments.crs,
         max_pose_gap_s=arguments.max_pose_gap_s,
         start=arguments.start,

@@ -8,16 +8,25 @@ them to `assemble`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
+from jaxmap.datasets.bit_depth import bits_note
 from jaxmap.datasets.calibration import read_mounting
-from jaxmap.datasets.images import ImageArray, first_image_size_px, read_image_pair
-from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.images import (
+    ImageArray,
+    first_image_size_px,
+    image_rotation_tag,
+    read_image_pair,
+    sequence_bits,
+)
+from jaxmap.datasets.options import Bits, ReadOptions
 from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE, PoseReading, stand_upright, to_z_up
 from jaxmap.datasets.poses import (
     PoseTrack,
@@ -29,7 +38,7 @@ from jaxmap.datasets.poses import (
     without_wild_poses,
 )
 from jaxmap.datasets.units import METRES, with_baseline_unit
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
 
@@ -45,7 +54,8 @@ class StereoPair(NamedTuple):
 class FrameRef:
     """One frame of a sequence: its image files and the time at which the left one was taken.
 
-    `name` is the left image's file name without its suffix; label files have the same name.
+    `name` is the left image's file name without its suffix; label files have the same name. Where images lie in one
+    file together, `left` and `right` only say where: bag, topic, time.
     """
 
     name: str
@@ -72,6 +82,10 @@ class StereoSequence:
         pose_faults: those of the notes that tell of poses that were left out as unusable.
         pose_reading: the conventions that the poses were read by.
         read_pair: reads the images of one frame.
+        rectify_labels: where `read_pair` rectifies: the same for labels (H, W) or probabilities (H, W, C) of the left
+            image of a frame as it lies on disk; else None.
+        true_disparity: reads the true disparity of a frame's left image in px, NaN where unknown; None where the
+            sequence has no truth, and for a frame without one.
     """
 
     name: str
@@ -84,6 +98,8 @@ class StereoSequence:
     site_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    rectify_labels: Callable[[FrameRef, np.ndarray], np.ndarray] | None = None
+    true_disparity: Callable[[FrameRef], np.ndarray | None] | None = None
     pose_faults: tuple[str, ...] = ()
     pose_reading: PoseReading = field(default_factory=PoseReading)
 
@@ -107,13 +123,16 @@ class Reader:
     cameras: tuple[str, ...] = ()
 
 
-def read_stereo_pair(frame: FrameRef) -> StereoPair:
+def read_stereo_pair(
+    frame: FrameRef, *, bits: Bits | None = None, size_px: tuple[int, int] | None = None
+) -> StereoPair:
     """Reads the images of one frame, see `images.read_image_pair`.
 
     Raises:
-        FrameError: an image cannot be read, or the two differ in size.
+        FrameError: an image cannot be read, or has another size than asked for or than the other one.
     """
-    return StereoPair(*read_image_pair(frame.left, frame.right, where=f"frame {frame.name} ({frame.right})"))
+    where = f"frame {frame.name} ({frame.right})"
+    return StereoPair(*read_image_pair(frame.left, frame.right, where, bits=bits, size_px=size_px))
 
 
 def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False) -> PoseTrack:
@@ -135,11 +154,10 @@ def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False
         )
     track = read_poses(path, options.quaternion, options.poses_time_unit)
     notes = [*track.notes]
-    T = reading_of(options, track).camera_poses(track.T)
-    T[:, :3, 3] *= METRES[options.poses_unit]
+    track = by_conventions(track, options)
     child = "camera" if options.pose_convention != "auto" else track.child
     if child == "body" and not allow_body:
-        if not stand_upright(T[track.usable]):
+        if not stand_upright(track.T[track.usable]):
             raise JaxmapError(
                 "a csv of EuRoC's form holds poses of the body, not of the camera",
                 where=path,
@@ -150,7 +168,14 @@ def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False
         notes.append(
             f"the poses in {path.name} stand upright as those of a camera's optical axes, and are taken for them"
         )
-    return replace(track, T=T, child=child, notes=tuple(notes))
+    return replace(track, child=child, notes=tuple(notes))
+
+
+def by_conventions(track: PoseTrack, options: ReadOptions) -> PoseTrack:
+    """A track as it was recorded, read by the options: poses of optical axes, and positions in metres."""
+    T = reading_of(options, track).camera_poses(track.T)
+    T[:, :3, 3] *= METRES[options.poses_unit]
+    return replace(track, T=T)
 
 
 def reading_of(options: ReadOptions, track: PoseTrack) -> PoseReading:
@@ -174,7 +199,9 @@ def assemble(
     T_child_camera: Float64[np.ndarray, "*frames 4 4"] | None = None,
     crs: str | None = None,
     notes: Sequence[str] = (),
-    read_pair: Callable[[FrameRef], StereoPair] = read_stereo_pair,
+    read_pair: Callable[[FrameRef], StereoPair] | None = None,
+    size_px: tuple[int, int] | None = None,
+    true_disparity: Callable[[FrameRef], np.ndarray | None] | None = None,
 ) -> StereoSequence:
     """Joins frames, poses and calibration into a sequence in a z-up world.
 
@@ -193,14 +220,16 @@ def assemble(
             where the child frame is the left camera.
         crs: the coordinate reference system of the poses.
         notes: what the reader reports to the user.
-        read_pair: reads the images of one frame.
+        read_pair: reads the images of one frame; by default from its files, with one depth of bits for all frames.
+        size_px: width and height of the images; by default those of the first image file.
+        true_disparity: reads the truth of one frame, where there is any.
 
     Raises:
         JaxmapError: frames out of order, counts that disagree, an image of another size than the
             calibration's, a selection without frames or without poses.
     """
     timestamps_s = np.array([frame.timestamp_s for frame in frames], np.float64)
-    _check_frames(frames, timestamps_s, camera, where)
+    _check_frames(frames, timestamps_s, camera, where, size_px)
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
     if options.poses_time_unit == "auto":
@@ -236,6 +265,9 @@ def assemble(
             f"{len(selected) - len(kept)} of {len(selected)} frames have no pose and are left out: "
             f"the frames span {_span(timestamps_s[selected])}, the poses {_span(track.timestamps_s)}"
         )
+    if read_pair is None:
+        bits = _bits(frames, options, all_notes)
+        read_pair = partial(read_stereo_pair, bits=bits, size_px=(camera.width_px, camera.height_px))
     row_of_frame = np.cumsum(has_pose) - 1
     return StereoSequence(
         name=name,
@@ -248,6 +280,7 @@ def assemble(
         site_origin=site_origin,
         crs=options.crs or crs,
         notes=tuple(all_notes),
+        true_disparity=true_disparity,
         pose_faults=track.faults,
         pose_reading=reading_of(options, track)._replace(
             poses_world=next(name for name, T in T_Z_UP_SOURCE.items() if np.array_equal(T, T_world_source))
@@ -256,7 +289,11 @@ def assemble(
 
 
 def _check_frames(
-    frames: Sequence[FrameRef], timestamps_s: np.ndarray, camera: StereoCamera | StereoRig, where: object
+    frames: Sequence[FrameRef],
+    timestamps_s: np.ndarray,
+    camera: StereoCamera | StereoRig,
+    where: object,
+    size_px: tuple[int, int] | None,
 ) -> None:
     """Checks the order of the times, and the size of the images against the calibration."""
     backwards = np.diff(timestamps_s, prepend=-np.inf) <= 0
@@ -267,13 +304,29 @@ def _check_frames(
             where=where,
             fix="correct the times of the frames",
         )
-    width_px, height_px = first_image_size_px((frame.left for frame in frames), where)
+    width_px, height_px = size_px or first_image_size_px((frame.left for frame in frames), where)
     if (width_px, height_px) != (camera.width_px, camera.height_px):
         raise JaxmapError(
             f"images are {width_px}x{height_px} px, the calibration is for {camera.width_px}x{camera.height_px} px",
             where=where,
             fix="give the calibration of these images",
         )
+
+
+def _bits(frames: Sequence[FrameRef], options: ReadOptions, notes: list[str]) -> Bits | None:
+    """How many bits 16-bit images use, as given or found; what was taken is noted, and a rotation tag, too."""
+    with suppress(FrameError):
+        if (tag := image_rotation_tag(frames[0].left)) != 1:
+            notes.append(
+                f"the images carry the rotation tag {tag}, which is not applied: calibration, labels and masks must "
+                "refer to the pixels as they are stored"
+            )
+    found = sequence_bits([(frame.left, frame.right) for frame in frames])
+    if found is None:
+        return options.image_bits
+    if options.image_bits is None:
+        notes.append(bits_note(*found))
+    return options.image_bits or found.bits
 
 
 def _no_pose(timestamps_s: np.ndarray, track: PoseTrack, options: ReadOptions) -> JaxmapError:

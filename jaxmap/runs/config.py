@@ -6,13 +6,11 @@ from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Lt
-
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.fusion.options import FusionOptions
 from jaxmap.geometry.options import DepthOptions, GridOptions
-from jaxmap.host.settings import NotNegative, Settings, options
+from jaxmap.host.settings import Seed, Settings, options
 from jaxmap.labellers.options import DeeplabOptions, PlaneOptions, ReliefOptions
 from jaxmap.stereo.match import StereoOptions
 
@@ -42,7 +40,7 @@ class MapConfig(ReadOptions):
     strict: bool = False
     """Stop where the quick check of the sequence finds something that makes the map wrong, and at the first unusable
     frame, instead of going on with a note."""
-    seed: Annotated[int, NotNegative, Lt(2**31)] = 0
+    seed: Annotated[int, Seed] = 0
     """Seed of all randomness."""
     grid: GridOptions = field(default_factory=GridOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)

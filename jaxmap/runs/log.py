@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from jaxmap.errors import JaxmapError
+from jaxmap.evaluation.geometry_scores import DisparityScores
 from jaxmap.mapping.sequence import FusedFrame
 
 MOST_KEPT = 2048
 TOO_NEAR_SHARE = 0.01
 """A frame is counted where more than this share of it is nearer than can be seen."""
 
-_STRICT = ConfigDict(extra="forbid")
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+Count = Annotated[int, Interval(ge=0, le=2**62)]
+Number = Annotated[float, Interval(ge=-1e15, le=1e15)]
+Seconds = Annotated[float, Interval(ge=0, le=1e15)]
 
 
 @dataclass
@@ -31,10 +37,10 @@ class Sample:
 
     __pydantic_config__ = _STRICT
 
-    kept: list[float] = field(default_factory=list)
-    stride: int = 1
-    count: int = 0
-    total: float = 0.0
+    kept: list[Number] = field(default_factory=list)
+    stride: Annotated[int, Interval(ge=1, le=2**62)] = 1
+    count: Count = 0
+    total: Number = 0.0
 
     def add(self, number: float) -> None:
         """Takes one more."""
@@ -65,6 +71,7 @@ class RunLog:
         without_ground: frames in which the labeller found no ground below the camera; None where it looks for none.
         too_near: frames of which more than a hundredth was left out as nearer than the searched disparities reach.
         nearest_px: the greatest disparity of what was left out so.
+        disparity: scores of the disparity of frames whose truth is known, by name.
         total_s: time spent on frames.
         compile_s: time spent on compiling.
         temporary_bytes: memory that the step takes beside the map.
@@ -74,18 +81,19 @@ class RunLog:
 
     __pydantic_config__ = _STRICT
 
-    next_index: int = 0
-    fused: int = 0
+    next_index: Count = 0
+    fused: Count = 0
     skipped: list[dict[str, str]] = field(default_factory=list)
     stages_ms: dict[str, Sample] = field(default_factory=dict)
     valid_fractions: Sample = field(default_factory=Sample)
-    points_fused: int = 0
-    without_ground: int | None = None
-    too_near: int = 0
-    nearest_px: float = 0.0
-    total_s: float = 0.0
-    compile_s: float = 0.0
-    temporary_bytes: int = 0
+    points_fused: Count = 0
+    without_ground: Count | None = None
+    disparity: dict[str, Sample] = field(default_factory=dict)
+    too_near: Count = 0
+    nearest_px: Number = 0.0
+    total_s: Seconds = 0.0
+    compile_s: Seconds = 0.0
+    temporary_bytes: Count = 0
     digest: str = ""
     complete: bool = False
 
@@ -110,6 +118,11 @@ class RunLog:
         # Of the plane labeller as of those that see relief.
         if (found := getattr(fused.info.estimate, "found", None)) is not None:
             self.without_ground = (self.without_ground or 0) + (not bool(found))
+
+    def add_scores(self, scores: DisparityScores) -> None:
+        """Takes note of how near the truth a frame's disparity is."""
+        for name, value in scores._asdict().items():
+            self.disparity.setdefault(name, Sample()).add(value)
 
     def as_json(self) -> dict[str, Any]:
         """The log as plain values."""

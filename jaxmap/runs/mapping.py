@@ -11,6 +11,7 @@ import numpy as np
 import jaxmap
 from jaxmap.ensemble.layer import named_layers
 from jaxmap.errors import JaxmapError
+from jaxmap.evaluation.geometry_scores import score_disparity
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
@@ -85,13 +86,15 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
+            if fused.info is not None and fused.prepared.index in plan.key_frames:
+                # Pictures are no part of the pipeline that is timed, and wait for the next save. Noted before the
+                # frame counts as done: an interrupt in between must not lose them.
+                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             log.add(fused)
             if fused.info is not None:
+                _score_disparity(plan, log, fused.prepared)
                 step_profile.step_done()
             on_frame(fused)
-            if fused.info is not None and fused.prepared.index in plan.key_frames:
-                # Pictures are no part of the pipeline that is timed, and wait for the next save.
-                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 _write_key_frames(plan, folder, key_frames)
@@ -100,8 +103,8 @@ def run_plan(
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
-            save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             _write_key_frames(plan, folder, key_frames)
+            save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
@@ -120,6 +123,28 @@ def run_plan(
     return metrics
 
 
+def _score_disparity(plan: Plan, log: RunLog, prepared: PreparedFrame) -> None:
+    """Compares the disparity of a rectified frame with its truth, where that is known.
+
+    Raises:
+        JaxmapError: the truth cannot be read, or is of another size.
+    """
+    read, rectified = plan.sequence.true_disparity, prepared.rectified
+    if read is None or rectified is None or plan.front_end.rectifier is not None:
+        return
+    truth_px = read(prepared.ref)
+    if truth_px is None:
+        return
+    if truth_px.shape != rectified.disparity_px.shape:
+        size, expected = (f"{shape[1]}x{shape[0]}" for shape in (truth_px.shape, rectified.disparity_px.shape))
+        raise JaxmapError(
+            f"the true disparity is {size} px, the image {expected} px",
+            where=f"frame {prepared.ref.name}",
+            fix="give the truth of this image, or remove it",
+        )
+    log.add_scores(score_disparity(rectified.disparity_px, truth_px))
+
+
 def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
     said = {finding.kind for finding in plan.findings}
@@ -129,6 +154,11 @@ def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
         yield (
             f"in {log.too_near} of {log.fused} frames something is nearer than {matcher.num_disparities} disparities "
             f"can see, and was left out: the map has a hole there; --stereo.num-disparities {needed:.0f} sees it"
+        )
+    if scores := metrics.get("disparity"):
+        yield (
+            f"against the true disparity: median error {scores['median_error_px']:.2f} px, {scores['bad_2']:.1%} off "
+            f"by more than 2 px, {scores['valid']:.0%} of the pixels matched"
         )
     if log.without_ground:
         yield (
@@ -278,6 +308,11 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "fused": log.points_fused,
             **({"frames_too_near": log.too_near} if log.too_near else {}),
         },
+        **(
+            {"disparity": {name: round(sample.total / sample.count, 4) for name, sample in log.disparity.items()}}
+            if log.disparity
+            else {}
+        ),
         "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),
         "memory": {
             "map_mib": round(voxel_map.log_odds.nbytes / 2**20, 2),

@@ -24,7 +24,7 @@ from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.geometry.options import GridOptions, Triple
-from jaxmap.host.files import bundled
+from jaxmap.host.files import bundled, real_path
 from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller
@@ -145,13 +145,14 @@ def choose_label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFol
         raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
     labels_are = config.labels_are
     if labels_are == "auto":
-        if isinstance(sequence.camera, StereoRig):
+        if isinstance(sequence.camera, StereoRig) or sequence.rectify_labels is not None:
             raise UsageError(
                 "the images are raw, and labels may lie on raw or on rectified pixels",
                 fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
             )
         labels_are = "rectified"
-    return open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
+    folder = open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
+    return replace(folder, rectify=sequence.rectify_labels)
 
 
 def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
@@ -338,7 +339,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
         ensemble, pose_errors = draw_ensemble(key, fusion_params, timestamps_s, config.ensemble)
 
     return Plan(
-        source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
+        source=source if source.startswith(SAMPLE_PREFIX) else str(real_path(source)),
         sequence=sequence,
         front_end=front_end,
         labeller=labeller,

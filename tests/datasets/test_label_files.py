@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +59,21 @@ def test_a_palette_image_holds_indices(tmp_path):
     np.testing.assert_array_equal(LabelFolder(tmp_path, False, 3, "raw").read(REF, PLAIN)["labels"], truth())
 
 
+@pytest.mark.parametrize("name", ["f000.PNG", "f000.tif", "f000.bmp", "deep", "grey as RGB", "two levels"])
+def test_indices_may_be_stored_in_other_ways(tmp_path, name):
+    labels = truth() if name != "two levels" else np.minimum(truth(), 1)
+    pictures = {
+        "deep": Image.fromarray(labels.astype(np.uint16)),
+        "grey as RGB": Image.fromarray(np.stack([labels] * 3, axis=-1)),
+        "two levels": Image.fromarray(labels == 1),
+    }
+    pictures.get(name, Image.fromarray(labels)).save(tmp_path / (name if "." in name else "f000.png"))
+    opened = open_label_folder(tmp_path, 3, "raw", "f000")
+    fields = opened.read(REF, PLAIN)
+    assert fields["labels"].dtype == np.uint8
+    np.testing.assert_array_equal(fields["labels"], labels)
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_probabilities_come_as_float32(tmp_path, dtype):
     fields = read_soft(tmp_path, one_hot().astype(dtype) * dtype(0.5))
@@ -107,8 +124,8 @@ def test_nothing_is_unpickled(tmp_path):
     [
         (np.full((HEIGHT_PX, WIDTH_PX), 3, np.uint8), "label 3, but there are 3 classes"),
         (np.zeros((60, 80), np.uint8), "the labels are 80x60 px"),
-        (np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8), "type RGB"),
-        (np.zeros((HEIGHT_PX, WIDTH_PX), np.uint16), "type I"),
+        (np.full((HEIGHT_PX, WIDTH_PX, 3), (0, 1, 2), np.uint8), "the mask is in colour"),
+        (np.full((HEIGHT_PX, WIDTH_PX), 256, np.uint16), "label 256, but there are 3 classes"),
     ],
 )
 def test_faulty_indices_are_refused(tmp_path, labels, named):
@@ -137,3 +154,49 @@ def test_the_first_frame_distinguishes_which_kind_they_are(tmp_path):
         open_label_folder(tmp_path, 3, "raw", "f002")
     with pytest.raises(JaxmapError, match="no such folder of labels"):
         open_label_folder(tmp_path / "nowhere", 3, "raw", "f000")
+
+
+def npy(header: bytes, data: bytes = b"") -> bytes:
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+HOSTILE_ARRAYS = {
+    "brackets that stay open": npy(b"(" * 60_000),
+    "minus signs": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"-" * 5_000 + b"1,)}\n"),
+    "a shape beyond memory": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000,)}\n"),
+    "the right number of axes, beyond memory": npy(
+        b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 1000000, 3)}\n"
+    ),
+    "no number among huge extents": npy(
+        b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999999999999999999, 0, 3)}\n"
+    ),
+    "negative extents": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-120, -160, 3)}\n"),
+    "objects": npy(b"{'descr': '|O', 'fortran_order': False, 'shape': (120, 160, 3)}\n", b"cos\nsystem\n"),
+    "half of the numbers": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (120, 160, 3)}\n", b"\0" * 1000),
+    "a later version": b"\x93NUMPY\x09\x00" + b"\0" * 100,
+    "an archive": b"PK\x03\x04" + b"\0" * 100,
+    "no header": b"\x93NUMPY",
+}
+
+
+@pytest.mark.parametrize("content", HOSTILE_ARRAYS.values(), ids=HOSTILE_ARRAYS.keys())
+def test_an_array_is_known_by_its_header_before_it_is_read(tmp_path, content):
+    path = tmp_path / "f000.npy"
+    path.write_bytes(content)
+    with pytest.raises(FrameError) as caught:
+        LabelFolder(tmp_path, True, 3, "rectified").read(REF, PLAIN)
+    assert str(path) in str(caught.value) and len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "archive of arrays"])
+def test_probabilities_are_regular_files(tmp_path, kind):
+    path = tmp_path / "f000.npy"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        with open(path, "wb") as file:
+            np.savez(file, one_hot())
+    with pytest.raises(FrameError, match=str(path)):
+        LabelFolder(tmp_path, True, 3, "rectified").read(REF, PLAIN)
