@@ -15,7 +15,7 @@ from jaxmap.errors import FrameError
 from jaxmap.stereo.align import match_features
 from jaxmap.stereo.front_end import StereoFrontEnd
 
-MIN_STEPS, MOST_STEPS = 20, 30
+MIN_STEPS, MOST_STEPS = 13, 30
 """Steps between consecutive frames that are needed, and those that are looked at."""
 
 WORKING_WIDTH_PX = 512

@@ -16,6 +16,9 @@ ROW_PX = 0.8
 AGREE_SHARE = 0.5
 """Where fewer matches agree on any rotation, the calibration is of other cameras, or the images of other moments."""
 
+HARDLY_ANY = 5
+"""Matches in a frame; images of one scene have more, however dull."""
+
 NEAR_SHARE, NEAR_MATCHES, NEAR_STOPS_SHARE = 0.02, 8, 0.1
 """Matches nearer than the disparities reach that are worth a word, and those that leave a hole in the map."""
 
@@ -51,7 +54,7 @@ def _no_matches(samples: Samples) -> list[Finding]:
     found = sum(len(pair.matches) for pair in samples.pairs)
     what = f"left and right have hardly anything in common: {found} matches of features in {len(samples.pairs)} frames"
     fix = "check that the two images of a frame are of one moment and scene, and that they show texture"
-    return [Finding("no-matches", False, 0.6, what, fix)]
+    return [Finding("no-matches", found < HARDLY_ANY * len(samples.pairs), 0.6, what, fix)]
 
 
 def _rows(camera: StereoCamera, alignment: Alignment, certain: float) -> list[Finding]:

@@ -45,7 +45,7 @@ def test_one_clock_is_not_doubted(seed):
     assert clock_offset(*drive(0.0, seed)) == []
 
 
-@pytest.mark.parametrize("kept", [10, 15])
+@pytest.mark.parametrize("kept", [5, 12])
 def test_few_frames_tell_nothing(kept):
     times_s, R, turns = drive(1.0, 0)
     assert clock_offset(times_s[: kept + 1], R[: kept + 1], turns[:kept]) == []
