@@ -25,7 +25,7 @@ from jaxmap.geometry.bounds import usable_depth
 from jaxmap.host.files import remove
 from jaxmap.host.output_folder import check_inputs_stay, locked, write_json
 from jaxmap.host.prefetch import prefetch
-from jaxmap.refinement.frames import DisparityFrame, make_disparity_frame, pinhole
+from jaxmap.refinement.frames import DisparityFrame, make_disparity_frame
 from jaxmap.refinement.ground import GroundRaster
 from jaxmap.refinement.refine import GroundReference, Refinement, refine, results
 from jaxmap.refinement.solver import Prior
@@ -34,7 +34,7 @@ from jaxmap.runs.evaluation import TruthOptions, read_truth
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
 from jaxmap.stereo.rectify import StereoRig
-from jaxmap.types import StereoCamera
+from jaxmap.types import StereoCamera, pinhole
 
 RESULTS = "refine.json"
 """Written first: a folder that holds it holds a refinement."""
