@@ -1,12 +1,12 @@
-"""Stereo visual odometry: the motion of a rectified stereo camera from its images alone.
+"""Stereo visual odometry: the motion of a rectified stereo camera, from its images alone.
 
-Points of a keyframe are followed into each pair, a robust pose is found from them, and where the view has changed
-enough the pair becomes a keyframe. The last keyframes and the points they see are adjusted together.
+Points of a keyframe are followed into each pair, and a robust pose is found from them; where the view has changed
+enough, the pair becomes a keyframe. The last keyframes and the points they see are adjusted together (`bundle`). A pair
+that does not become a keyframe keeps its pose relative to the last one, so that a standing camera does not drift.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -14,182 +14,287 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from jaxmap.localisation.bundle import Bundle, Sightings, adjust, adjust_pose, project, to_camera, to_world, triangulate
-from jaxmap.localisation.features import View, coarse_disparity_at, find_corners, follow, match_right
+from jaxmap.localisation.features import (
+    View,
+    coarse_disparity_at,
+    find_corners,
+    follow,
+    match_descriptors,
+    match_right,
+)
 from jaxmap.types import Pinhole
 
 POINTS = 400
-MIN_POINTS = 15
-WINDOW = 8
-SIGMA_PX = 0.5
-INLIER_PX = 2.0
-MIN_DISPARITY_PX = 1.0
-KEEP_SHARE = 0.7
-MOVED_PX = 20.0
+"""Points wanted in a keyframe."""
+
+LEAST_POINTS = 20
+"""A pose that fewer points agree on is none."""
+
+LEAST_SHARE, GOOD_SHARE = 0.2, 0.6
+"""Of the points that should be in view: a pose with a smaller share is none, with a greater one no other is tried."""
+
+KEEP_SHARE, MOVED_SHARE = 0.7, 0.02
+"""A pair becomes a keyframe where it shows a smaller share of the points, or they have moved by more of its width."""
+
+WINDOW, HELD = 8, 2
+"""Keyframes that are adjusted together; so many of the oldest stay where they are."""
+
+LEAST_DISPARITY_PX = 1.0
+"""Points farther away have no depth worth the name."""
+
+SIGMA_PX = 0.4
+"""Standard deviation of a point's place."""
+
+OFF_PX, FAR_OFF_PX = 2.0, 6.0
+"""How far a point may lie off where a pose projects it: followed, and matched by its look alone."""
+
+MOST_BRIDGED = 5
+"""Over so many pairs that match nothing the camera is assumed to keep its motion, at most."""
 
 
 class Keyframe(NamedTuple):
-    """A pair with its points: `ids` (N,), `uvr_px` (N, 3)."""
+    """A pair with its points: `ids` (N,) count all points from the first on, `uvr_px` (N, 3) as in `Sightings`."""
 
-    frame: int
-    view: View
+    T_world_camera: Float64[np.ndarray, "4 4"]
     ids: Int[np.ndarray, "N"]
     uvr_px: Float64[np.ndarray, "N 3"]
 
 
-class Found(NamedTuple):
-    """Points of a keyframe in another pair: their rows in the keyframe, where, and the pose that explains them."""
+class Located(NamedTuple):
+    """A pose of a pair, and the points of the last keyframe that agree on it: their rows there, and places here."""
 
-    rows: np.ndarray
-    uvr_px: np.ndarray
-    T_world_camera: np.ndarray
+    T_world_camera: Float64[np.ndarray, "4 4"]
+    rows: Int[np.ndarray, "N"]
+    uvr_px: Float64[np.ndarray, "N 3"]
+    expected: int
 
 
-class Odometry:
+class Track(NamedTuple):
+    """Poses of a camera.
+
+    Attributes:
+        frames: the frames that have one, counted from 0.
+        T_world_camera: (N, 4, 4), in the frame of the first of them.
+        inliers: (N,) points that agree on each; in the first one, those it begins with.
+        bridged: frames before which no motion was seen, and where it is assumed to have stayed the same.
+        keyframes: how many of them are keyframes.
+        moved_px: how far points have moved in the image from the last keyframe, at most: 0 for a standing camera.
+    """
+
+    frames: Int[np.ndarray, "N"]
+    T_world_camera: Float64[np.ndarray, "N 4 4"]
+    inliers: Int[np.ndarray, "N"]
+    bridged: list[int]
+    keyframes: int
+    moved_px: float
+
+
+class StereoOdometry:
+    """Takes the pairs of a sequence one after the other; the same pairs give the same poses."""
+
     def __init__(self, camera: Pinhole) -> None:
         self.camera = camera
-        self.keyframes: list[Keyframe] = []
-        self.T: list[np.ndarray] = []
-        self.points = np.zeros((0, 3))
-        self.relative: list[tuple[int, np.ndarray]] = []
-        self.velocity = np.eye(4)
-        self.log = []
+        self.bridged: list[int] = []
+        self.moved_px = 0.0
+        self._K = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+        self._done: list[np.ndarray] = []
+        self._window: list[Keyframe] = []
+        self._view: View | None = None
+        self._points, self._first_id = np.zeros((0, 3)), 0
+        self._poses: list[tuple[int, int, np.ndarray, int]] = []
+        self._motion = np.eye(4)
+        self._pending: tuple[int, View] | None = None
 
-    def add(self, view: View) -> None:
-        if not self.keyframes:
-            self._new_keyframe(view, np.eye(4), np.zeros(0, int), np.zeros((0, 3)))
-            self.relative.append((0, np.eye(4)))
-            return
-        last = self.keyframes[-1]
-        T_before = self.T[self.relative[-1][0]] @ self.relative[-1][1]
-        guesses = [T_before @ self.velocity, T_before]
-        best = None
-        for guess in guesses:
-            found = self._locate(last, view, guess)
-            if found is not None and (best is None or len(found.rows) > len(best.rows)):
-                best = found
-            if best is not None and len(best.rows) > 0.5 * len(last.ids):
+    def add(self, frame: int, view: View | None) -> int:
+        """Takes the next pair; None for one that shows nothing.
+
+        Returns:
+            How many points agree on its pose, 0 where it has none.
+        """
+        if view is None:
+            return 0
+        if self._view is None:
+            return self._begin(frame, view, np.eye(4))
+        gap = frame - self._poses[-1][0]
+        T_before = self._latest()
+        located = self._locate(view, T_before, gap)
+        if located is None and self._pending is not None and gap <= MOST_BRIDGED + 1:
+            located = self._bridge(frame, view)
+        if located is None:
+            self._pending = frame, view
+            return 0
+        return self._take(frame, view, located)
+
+    def track(self) -> Track:
+        """The poses so far."""
+        keyframes = np.array(self._done + [keyframe.T_world_camera for keyframe in self._window]).reshape(-1, 4, 4)
+        frames, bases, relative, inliers = zip(*self._poses, strict=True) if self._poses else ((), (), (), ())
+        T = keyframes[np.array(bases, int)] @ np.array(relative).reshape(-1, 4, 4)
+        counts = np.array(inliers, int)
+        return Track(np.array(frames, int), T, counts, self.bridged, len(keyframes), self.moved_px)
+
+    def _latest(self) -> np.ndarray:
+        """The last pose, in the present state of its keyframe."""
+        return self._window[-1].T_world_camera @ self._poses[-1][2]
+
+    def _begin(self, frame: int, view: View, T_world_camera: np.ndarray) -> int:
+        """Makes a pair a keyframe that shares no point with those before it."""
+        keyframe = self._with_new_points(view, T_world_camera, np.zeros(0, int), np.zeros((0, 3)))
+        if len(keyframe.ids) < LEAST_POINTS:
+            return 0
+        self._push(keyframe, view)
+        self._poses.append((frame, len(self._done) + len(self._window) - 1, np.eye(4), len(keyframe.ids)))
+        return len(keyframe.ids)
+
+    def _take(self, frame: int, view: View, located: Located) -> int:
+        """Records the pose of a pair, and makes it a keyframe where it shows much that is new."""
+        last = self._window[-1]
+        steps = frame - self._poses[-1][0]
+        if steps == 1:
+            self._motion = np.linalg.inv(self._latest()) @ located.T_world_camera
+        self._pending = None
+        moved_px = float(np.median(np.hypot(*(located.uvr_px - last.uvr_px[located.rows])[:, :2].T)))
+        self.moved_px = max(self.moved_px, moved_px)
+        relative = np.linalg.inv(last.T_world_camera) @ located.T_world_camera
+        if len(located.rows) < KEEP_SHARE * len(last.ids) or moved_px > MOVED_SHARE * view.left.shape[1]:
+            ids = last.ids[located.rows]
+            self._push(self._with_new_points(view, located.T_world_camera, ids, located.uvr_px), view)
+            relative = np.eye(4)
+        self._poses.append((frame, len(self._done) + len(self._window) - 1, relative, len(located.rows)))
+        return len(located.rows)
+
+    def _bridge(self, frame: int, view: View) -> Located | None:
+        """Goes on from the last pair that matched nothing, if this one matches that."""
+        assert self._pending is not None
+        before, view_before = self._pending
+        kept = self._view, list(self._window), list(self._done), list(self._poses), self._points, self._first_id
+        T = self._latest() @ np.linalg.matrix_power(self._motion, before - self._poses[-1][0])
+        if self._begin(before, view_before, T) and (located := self._locate(view, T, frame - before)) is not None:
+            self.bridged.append(before)
+            return located
+        self._view, self._window, self._done, self._poses, self._points, self._first_id = kept
+        return None
+
+    def _push(self, keyframe: Keyframe, view: View) -> None:
+        """Adds a keyframe, and adjusts those of the window."""
+        self._window.append(keyframe)
+        self._view = view
+        if len(self._window) > 1:
+            self._adjust()
+        if len(self._window) == WINDOW:
+            self._done.append(self._window.pop(0).T_world_camera)
+            oldest = min((int(kept.ids.min()) for kept in self._window if len(kept.ids)), default=self._first_id)
+            self._points, self._first_id = self._points[oldest - self._first_id :], oldest
+
+    def _points_of(self, ids: np.ndarray) -> np.ndarray:
+        return self._points[ids - self._first_id]
+
+    def _with_new_points(self, view: View, T_world_camera: np.ndarray, ids: np.ndarray, uvr_px: np.ndarray) -> Keyframe:
+        """A keyframe with the points it shares with the last one, and new ones where it has few."""
+        corners = find_corners(view, uvr_px[:, :2], POINTS)
+        right, seen = match_right(view, corners, coarse_disparity_at(view, corners))
+        new = np.column_stack([corners, right])[seen]
+        new = new[new[:, 0] - new[:, 2] + self.camera.doffs_px > LEAST_DISPARITY_PX]
+        fresh = self._first_id + len(self._points) + np.arange(len(new))
+        self._points = np.concatenate([self._points, to_world(T_world_camera, triangulate(self.camera, new))])
+        return Keyframe(T_world_camera, np.concatenate([ids, fresh]), np.concatenate([uvr_px, new]))
+
+    def _locate(self, view: View, T_before: np.ndarray, gap: int) -> Located | None:
+        """The pose of a pair from the points of the last keyframe; None where they do not agree on one."""
+        best: Located | None = None
+        for guess in (self._as_before(T_before, gap), lambda: T_before, lambda: self._alike(view)):
+            T = guess()
+            if T is None or (located := self._locate_near(view, T)) is None:
+                continue
+            if best is None or len(located.rows) > len(best.rows):
+                best = located
+            if len(best.rows) > GOOD_SHARE * best.expected:
                 break
-        if best is None or len(best.rows) < 0.3 * len(last.ids):
-            guess = self._coarse(last, view)
-            if guess is not None:
-                found = self._locate(last, view, guess)
-                if found is not None and (best is None or len(found.rows) > len(best.rows)):
-                    best = found
-        if best is None:
-            raise RuntimeError(f"lost at {len(self.relative)}")
-        moved = np.median(np.linalg.norm(best.uvr_px[:, :2] - last.uvr_px[best.rows, :2], axis=1))
-        share = len(best.rows) / len(last.ids)
-        self.velocity = np.linalg.inv(T_before) @ best.T_world_camera
-        self.log.append((len(last.ids), len(best.rows), moved))
-        if share < KEEP_SHARE or moved > MOVED_PX:
-            self._new_keyframe(view, best.T_world_camera, last.ids[best.rows], best.uvr_px)
-            self.relative.append((len(self.keyframes) - 1, np.eye(4)))
-        else:
-            self.relative.append((len(self.keyframes) - 1, np.linalg.inv(self.T[-1]) @ best.T_world_camera))
+        return best
 
-    def poses(self) -> np.ndarray:
-        return np.stack([self.T[k] @ T for k, T in self.relative])
+    def _as_before(self, T_before: np.ndarray, gap: int):
+        return lambda: T_before @ np.linalg.matrix_power(self._motion, gap)
 
-    def _locate(self, keyframe: Keyframe, view: View, guess: np.ndarray) -> Found | None:
-        points = self.points[keyframe.ids]
-        expected = project(self.camera, to_camera(guess, points))
-        height, width = view.left.shape
-        ahead = np.isfinite(expected).all(axis=1)
-        ahead &= (expected[:, :2] > -40).all(axis=1) & (expected[:, 0] < width + 40) & (expected[:, 1] < height + 40)
-        rows = np.flatnonzero(ahead)
-        pixels, good = follow(keyframe.view.left, view.left, keyframe.uvr_px[rows, :2], expected[rows, :2], 3)
-        rows, pixels, expected = rows[good], pixels[good], expected[rows[good]]
-        if len(rows) < MIN_POINTS:
+    def _locate_near(self, view: View, T_guess: np.ndarray) -> Located | None:
+        """The pose near a guess: followed coarsely at first, then from where the pose found so projects the points."""
+        assert self._view is not None
+        keyframe, points = self._window[-1], self._points_of(self._window[-1].ids)
+        rows, expected = self._in_view(view, T_guess, points)
+        places = keyframe.uvr_px[rows, :2]
+        pixels, good = follow(self._view.left, view.left, places, expected[:, :2], levels=3, window_px=21)
+        T = self._pose_by_ransac(points[rows[good]], pixels[good], OFF_PX, 200)
+        if T is None:
             return None
-        K = np.array([[self.camera.fx_px, 0, self.camera.cx_px], [0, self.camera.fy_px, self.camera.cy_px], [0, 0, 1]])
+        rows, expected = self._in_view(view, T, points)
+        if len(rows) < LEAST_POINTS:
+            return None
+        places = keyframe.uvr_px[rows, :2]
+        pixels, good = follow(self._view.left, view.left, places, expected[:, :2], levels=1, window_px=15)
+        right, seen = match_right(view, pixels, expected[:, 0] - expected[:, 2])
+        good &= seen
+        uvr_px, kept = np.column_stack([pixels, right])[good], rows[good]
+        for _ in range(2):
+            if len(kept) < max(LEAST_POINTS, LEAST_SHARE * len(rows)):
+                return None
+            T = adjust_pose(self.camera, T, points[kept], uvr_px, SIGMA_PX)
+            near = np.abs(project(self.camera, to_camera(T, points[kept])) - uvr_px).max(axis=1) < OFF_PX
+            kept, uvr_px = kept[near], uvr_px[near]
+        return Located(T, kept, uvr_px, len(rows))
+
+    def _in_view(self, view: View, T: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The points that a camera there would see, and where."""
+        expected = project(self.camera, to_camera(T, points))
+        inside = ((expected[:, :2] > 0) & (expected[:, :2] < view.left.shape[::-1])).all(axis=1)
+        rows = np.flatnonzero(inside & np.isfinite(expected).all(axis=1))
+        return rows, expected[rows]
+
+    def _alike(self, view: View) -> np.ndarray | None:
+        """The pose by points that look alike, however far it is from the last one."""
+        assert self._view is not None
+        here, there = match_descriptors(self._view, view, 1500)
+        local = triangulate(self.camera, np.column_stack([here, here[:, 0] - coarse_disparity_at(self._view, here)]))
+        known = np.isfinite(local).all(axis=1)
+        points = to_world(self._window[-1].T_world_camera, local[known])
+        return self._pose_by_ransac(points, there[known], FAR_OFF_PX, 1000)
+
+    def _pose_by_ransac(self, points: np.ndarray, pixels: np.ndarray, within_px: float, tries: int):
+        """T_world_camera of a camera that sees points at pixels; None where too few agree."""
+        if len(points) < LEAST_POINTS:
+            return None
         cv2.setRNGSeed(0)
         try:
-            ok, rotation, translation, inliers = cv2.solvePnPRansac(
-                self.points[keyframe.ids[rows]], np.ascontiguousarray(pixels), K, np.zeros(4), iterationsCount=200, reprojectionError=INLIER_PX, confidence=0.999
+            found, rotation, translation, inliers = cv2.solvePnPRansac(
+                points,
+                np.ascontiguousarray(pixels),
+                self._K,
+                np.zeros(4),
+                iterationsCount=tries,
+                reprojectionError=within_px,
+                confidence=0.999,
             )
         except cv2.error:
             return None
-        if not ok or inliers is None or len(inliers) < MIN_POINTS:
+        if not found or inliers is None or len(inliers) < LEAST_POINTS:
             return None
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
-        T = np.linalg.inv(T)
-        inliers = np.sort(inliers.ravel())
-        rows, pixels = rows[inliers], pixels[inliers]
-        expected = project(self.camera, to_camera(T, self.points[keyframe.ids[rows]]))
-        right, seen = match_right(view, pixels, expected[:, 0] - expected[:, 2])
-        rows, uvr = rows[seen], np.column_stack([pixels, right])[seen]
-        if len(rows) < MIN_POINTS:
-            return None
-        points = self.points[keyframe.ids[rows]]
-        T = adjust_pose(self.camera, T, points, uvr, SIGMA_PX)
-        off = np.abs(project(self.camera, to_camera(T, points)) - uvr).max(axis=1)
-        kept = off < 2 * INLIER_PX
-        if kept.sum() < MIN_POINTS:
-            return None
-        return Found(rows[kept], uvr[kept], T)
-
-    def _coarse(self, keyframe: Keyframe, view: View) -> np.ndarray | None:
-        orb = cv2.ORB.create(1500)
-        small = [cv2.resize(v.left, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for v in (keyframe.view, view)]
-        (kp1, d1), (kp2, d2) = (orb.detectAndCompute(s, None) for s in small)
-        if d1 is None or d2 is None:
-            return None
-        matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(d1, d2)
-        p1 = np.array([kp1[m.queryIdx].pt for m in matches]) * 2 + 0.5
-        p2 = np.array([kp2[m.trainIdx].pt for m in matches]) * 2 + 0.5
-        d = coarse_disparity_at(keyframe.view, p1)
-        ok = np.isfinite(d)
-        uvr = np.column_stack([p1, p1[:, 0] - d])[ok]
-        points = to_world(self.T[self.keyframes.index(keyframe) if False else -1], triangulate(self.camera, uvr))
-        K = np.array([[self.camera.fx_px, 0, self.camera.cx_px], [0, self.camera.fy_px, self.camera.cy_px], [0, 0, 1]])
-        good = np.isfinite(points).all(axis=1)
-        if good.sum() < MIN_POINTS:
-            return None
-        cv2.setRNGSeed(0)
-        try:
-            found, rotation, translation, inliers = cv2.solvePnPRansac(points[good], np.ascontiguousarray(p2[ok][good]), K, np.zeros(4), iterationsCount=1000, reprojectionError=6.0, confidence=0.999)
-        except cv2.error:
-            return None
-        if not found or inliers is None or len(inliers) < MIN_POINTS:
-            return None
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
-        self.log.append(("coarse", len(matches), len(inliers)))
-        return np.linalg.inv(T)
-
-    def _new_keyframe(self, view: View, T: np.ndarray, ids: np.ndarray, uvr: np.ndarray) -> None:
-        if len(ids) < POINTS:
-            corners = find_corners(view, uvr[:, :2], POINTS)
-            right, seen = match_right(view, corners, coarse_disparity_at(view, corners))
-            new = np.column_stack([corners, right])[seen]
-            new = new[new[:, 0] - new[:, 2] + self.camera.doffs_px > MIN_DISPARITY_PX]
-            fresh = len(self.points) + np.arange(len(new))
-            self.points = np.concatenate([self.points, to_world(T, triangulate(self.camera, new))])
-            ids, uvr = np.concatenate([ids, fresh]), np.concatenate([uvr, new])
-        self.keyframes.append(Keyframe(len(self.relative), view, ids, uvr))
-        self.T.append(T)
-        if len(self.keyframes) > 1 and self.window > 1:
-            self._adjust()
-
-    window = WINDOW
+        T_camera_world = np.eye(4)
+        T_camera_world[:3, :3], T_camera_world[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+        return np.linalg.inv(T_camera_world)
 
     def _adjust(self) -> None:
-        first = max(0, len(self.keyframes) - self.window)
-        window = self.keyframes[first:]
-        ids = np.concatenate([k.ids for k in window])
-        cameras = np.repeat(np.arange(len(window)), [len(k.ids) for k in window])
-        uvr = np.concatenate([k.uvr_px for k in window])
-        unique, index, counts = np.unique(ids, return_inverse=True, return_counts=True)
-        often = counts[index] > 1
-        used = np.flatnonzero(counts > 1)
-        renumber = np.full(len(unique), -1)
-        renumber[used] = np.arange(len(used))
-        seen = Sightings(cameras[often], renumber[index[often]], uvr[often])
-        fixed = np.zeros(len(window), bool)
-        fixed[0] = True
-        if len(window) == self.window:
-            fixed[: self.window // 4] = True
-        bundle = adjust(self.camera, Bundle(np.stack(self.T[first:]), self.points[unique[used]]), seen, fixed, SIGMA_PX)
-        self.T[first:] = list(bundle.T_world_camera)
-        self.points[unique[used]] = bundle.points_world
+        """Adjusts the keyframes of the window, and the points that two of them see at least."""
+        ids = np.concatenate([keyframe.ids for keyframe in self._window])
+        cameras = np.repeat(np.arange(len(self._window)), [len(keyframe.ids) for keyframe in self._window])
+        uvr_px = np.concatenate([keyframe.uvr_px for keyframe in self._window])
+        counts = np.bincount(ids - self._first_id, minlength=len(self._points))
+        again = counts[ids - self._first_id] > 1
+        if not again.any():
+            return
+        shared, points = np.unique(ids[again], return_inverse=True)
+        fixed = np.arange(len(self._window)) < (HELD if len(self._window) == WINDOW else 1)
+        start = Bundle(np.array([keyframe.T_world_camera for keyframe in self._window]), self._points_of(shared))
+        found = adjust(self.camera, start, Sightings(cameras[again], points, uvr_px[again]), fixed, SIGMA_PX)
+        self._points[shared - self._first_id] = found.points_world
+        self._window = [
+            keyframe._replace(T_world_camera=T)
+            for keyframe, T in zip(self._window, found.T_world_camera, strict=True)
+        ]
