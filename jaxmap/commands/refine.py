@@ -62,7 +62,7 @@ class RefineArguments:
     dataset: str = "auto"
     """The reader: auto, kitti, euroc, folder or katwijk."""
     poses: Path | None = None
-    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
+    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
     camera: str | None = None

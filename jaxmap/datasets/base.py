@@ -18,10 +18,21 @@ from jaxtyping import Float64
 from jaxmap.datasets.calibration import read_mounting
 from jaxmap.datasets.images import ImageArray, first_image_size_px, read_image_pair
 from jaxmap.datasets.options import ReadOptions
-from jaxmap.datasets.poses import PoseTrack, poses_at, read_poses, split_site_origin, to_z_up, with_timestamps
+from jaxmap.datasets.poses import (
+    PoseTrack,
+    make_pose_track,
+    poses_at,
+    read_poses,
+    split_site_origin,
+    to_z_up,
+    with_timestamps,
+)
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
+
+OnFrame = Callable[[int, int], None]
+"""Called with the number of frames done, and of all."""
 
 
 class StereoPair(NamedTuple):
@@ -102,8 +113,17 @@ def read_stereo_pair(frame: FrameRef) -> StereoPair:
     return StereoPair(*read_image_pair(frame.left, frame.right, where=f"frame {frame.name} ({frame.right})"))
 
 
+UNPOSED = make_pose_track(np.zeros(1), np.eye(4)[None], where="--poses odometry")
+"""Stands for the poses that are estimated later, from the images."""
+
+
+def from_images(options: ReadOptions) -> bool:
+    """Whether the poses are to be estimated from the images: `--poses odometry`, and no file is called so."""
+    return options.poses == Path("odometry") and not options.poses.is_file()
+
+
 def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False) -> PoseTrack:
-    """The poses given by the options, else those of the sequence.
+    """The poses given by the options, else those of the sequence; `UNPOSED` where the images are to give them.
 
     Args:
         options: `poses` has precedence.
@@ -113,11 +133,14 @@ def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False
     Raises:
         JaxmapError: there are none, or they are poses of a body and the reader cannot use them.
     """
+    if from_images(options):
+        return UNPOSED
     path = options.poses or own
     if not options.poses and not own.is_file():
         raise JaxmapError(
             f"the sequence has no poses: there is no file {own}",
-            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera)",
+            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera), "
+            "or estimate them from the images: --poses odometry",
         )
     track = read_poses(path)
     if track.child == "body" and not allow_body:
@@ -179,6 +202,12 @@ def assemble(
             f"start {options.start}, stop {options.stop}, stride {options.stride} select none of {len(frames)} frames",
             where=where,
             fix="choose another range",
+        )
+    if track is UNPOSED:
+        # All of them: a stride comes after the odometry, which needs every frame.
+        seen = tuple(frames[options.start : options.stop])
+        return StereoSequence(
+            name, dataset, camera, seen, np.tile(np.eye(4), (len(seen), 1, 1)), read_pair, notes=tuple(notes)
         )
     kept = selected[has_pose[selected]]
     if not len(kept):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.base import UNPOSED, FrameRef, Reader, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.images import list_images
 from jaxmap.datasets.options import ReadOptions
@@ -86,8 +86,8 @@ def _timed_images(folder: Path, images: list[Path], track: PoseTrack) -> tuple[l
         times = np.array([float(image.stem) for image in images])
         if any("." in image.stem for image in images) or times.max() >= _MIN_UNIX_TIME_S:
             return images, times / _per_second(times), "times of the frames from the file names"
-    if len(images) == len(track.T):
-        if track.timestamps_s is None:
+    if track is UNPOSED or len(images) == len(track.T):
+        if track is UNPOSED or track.timestamps_s is None:
             return images, np.arange(float(len(images))), "frames numbered 0, 1, 2 ... s, as no times are known"
         return images, track.timestamps_s, "times of the frames from the poses, one for each"
     raise JaxmapError(

@@ -25,7 +25,7 @@ class ReadOptions:
     dataset: str = "auto"
     """The reader: auto, kitti, euroc, folder or katwijk."""
     poses: Path | None = None
-    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
+    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
     poses_world: PosesWorld = "auto"
     """World of the poses: z up, camera-like (y down), or find out."""
     calibration: Path | None = None

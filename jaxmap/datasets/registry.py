@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxmap.datasets import euroc, folder, katwijk, kitti
-from jaxmap.datasets.base import Reader, StereoSequence
+from jaxmap.datasets.base import OnFrame, Reader, StereoSequence, from_images
 from jaxmap.datasets.crs import check_crs
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.samples import open_sample
+from jaxmap.datasets.visual_odometry import with_odometry
 from jaxmap.errors import JaxmapError, UsageError
 
 SAMPLE_PREFIX = "sample:"
@@ -29,8 +30,15 @@ def register(reader: Reader) -> None:
     READERS[reader.name] = reader
 
 
-def open_sequence(source: str | Path, options: ReadOptions | None = None) -> StereoSequence:
+def open_sequence(
+    source: str | Path, options: ReadOptions | None = None, on_frame: OnFrame = lambda done, total: None
+) -> StereoSequence:
     """Opens the folder of one sequence, or `sample:NAME` for a bundled one.
+
+    Args:
+        source: the folder or sample.
+        options: how it is read.
+        on_frame: is told of the progress of odometry, the one thing that takes long.
 
     Raises:
         UsageError: an option names no reader, no camera or no coordinate reference system.
@@ -44,7 +52,7 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
     if options.crs is not None:
         check_crs(options.crs)
     if str(source).startswith(SAMPLE_PREFIX):
-        return open_sample(str(source).removeprefix(SAMPLE_PREFIX), options)
+        return _posed(open_sample(str(source).removeprefix(SAMPLE_PREFIX), options), options, on_frame)
     path = Path(source)
     if not path.is_dir():
         what = f"{source} is a file" if path.exists() else f"there is no folder {source}"
@@ -53,7 +61,12 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
     if options.camera is not None and options.camera not in reader.cameras:
         fix = f"choose {' or '.join(reader.cameras)}" if reader.cameras else "leave the option out"
         raise UsageError(f"{reader.name} has no camera {options.camera!r}", where="--camera", fix=fix)
-    return reader.open(path, options)
+    return _posed(reader.open(path, options), options, on_frame)
+
+
+def _posed(sequence: StereoSequence, options: ReadOptions, on_frame: OnFrame) -> StereoSequence:
+    """The sequence, with the poses that its images give where these are asked for."""
+    return with_odometry(sequence, options, katwijk.up_in_camera, on_frame) if from_images(options) else sequence
 
 
 def _recognise(path: Path) -> Reader:

@@ -10,11 +10,11 @@ import numpy as np
 import skimage
 from jaxtyping import Float32
 
-from jaxmap.datasets.base import FrameRef, StereoSequence, assemble
+from jaxmap.datasets.base import FrameRef, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.katwijk import open_katwijk
 from jaxmap.datasets.options import ReadOptions
-from jaxmap.datasets.poses import make_pose_track, read_poses
+from jaxmap.datasets.poses import make_pose_track
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.files import bundled
 from jaxmap.types import make_stereo_camera
@@ -63,7 +63,9 @@ def _open_motorcycle(options: ReadOptions) -> StereoSequence:
         dataset="sample",
         where="sample:motorcycle",
         frames=[FrameRef(left.stem, 0.0, left, right)],
-        track=read_poses(options.poses) if options.poses else make_pose_track(np.zeros(1), np.eye(4)[None]),
+        track=read_pose_track(options, options.poses)
+        if options.poses
+        else make_pose_track(np.zeros(1), np.eye(4)[None]),
         camera=read_camera_yaml(options.calibration) if options.calibration else camera,
         options=options,
     )

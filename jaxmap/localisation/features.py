@@ -151,9 +151,10 @@ def follow(
     """Where pixels of an image lie in another one, and whether they come back when they are followed back.
 
     Args:
-        source, target: the images.
-        pixels: in the source.
-        guess: in the target, about.
+        source: an image.
+        target: another one.
+        pixels: columns and rows in the source.
+        guess: about where they lie in the target.
         levels: of the pyramid, above the image: each doubles how far off the guess may be.
         window_px: what is compared around a pixel.
     """

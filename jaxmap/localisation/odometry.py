@@ -116,7 +116,7 @@ class StereoOdometry:
         if self._view is None:
             return self._begin(frame, view, np.eye(4))
         gap = frame - self._poses[-1][0]
-        T_before = self._latest()
+        T_before = self.latest()
         located = self._locate(view, T_before, gap)
         if located is None and self._pending is not None and gap <= MOST_BRIDGED + 1:
             located = self._bridge(frame, view)
@@ -133,8 +133,8 @@ class StereoOdometry:
         counts = np.array(inliers, int)
         return Track(np.array(frames, int), T, counts, self.bridged, len(keyframes), self.moved_px)
 
-    def _latest(self) -> np.ndarray:
-        """The last pose, in the present state of its keyframe."""
+    def latest(self) -> np.ndarray:
+        """The pose of the last frame that has one, as far as it is known now."""
         return self._window[-1].T_world_camera @ self._poses[-1][2]
 
     def _begin(self, frame: int, view: View, T_world_camera: np.ndarray) -> int:
@@ -151,7 +151,7 @@ class StereoOdometry:
         last = self._window[-1]
         steps = frame - self._poses[-1][0]
         if steps == 1:
-            self._motion = np.linalg.inv(self._latest()) @ located.T_world_camera
+            self._motion = np.linalg.inv(self.latest()) @ located.T_world_camera
         self._pending = None
         moved_px = float(np.median(np.hypot(*(located.uvr_px - last.uvr_px[located.rows])[:, :2].T)))
         self.moved_px = max(self.moved_px, moved_px)
@@ -168,7 +168,7 @@ class StereoOdometry:
         assert self._pending is not None
         before, view_before = self._pending
         kept = self._view, list(self._window), list(self._done), list(self._poses), self._points, self._first_id
-        T = self._latest() @ np.linalg.matrix_power(self._motion, before - self._poses[-1][0])
+        T = self.latest() @ np.linalg.matrix_power(self._motion, before - self._poses[-1][0])
         if self._begin(before, view_before, T) and (located := self._locate(view, T, frame - before)) is not None:
             self.bridged.append(before)
             return located
@@ -295,6 +295,5 @@ class StereoOdometry:
         found = adjust(self.camera, start, Sightings(cameras[again], points, uvr_px[again]), fixed, SIGMA_PX)
         self._points[shared - self._first_id] = found.points_world
         self._window = [
-            keyframe._replace(T_world_camera=T)
-            for keyframe, T in zip(self._window, found.T_world_camera, strict=True)
+            keyframe._replace(T_world_camera=T) for keyframe, T in zip(self._window, found.T_world_camera, strict=True)
         ]

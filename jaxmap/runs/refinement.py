@@ -206,7 +206,7 @@ def read_inputs(source: str, options: ReadOptions, advance: Advance = lambda don
         JaxmapError: the sequence cannot be read, or fewer than two of its frames can.
     """
     started_s = time.perf_counter()
-    sequence = open_sequence(source, options)
+    sequence = open_sequence(source, options, lambda done, total: advance(0.0, f"odometry {done} of {total}"))
     front_end = StereoFrontEnd(sequence.camera, StereoOptions())
     used: list[DisparityFrame] = []
     kept: list[int] = []
