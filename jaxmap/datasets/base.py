@@ -119,7 +119,8 @@ UNPOSED = make_pose_track(np.zeros(1), np.eye(4)[None], where="--poses odometry"
 
 def from_images(options: ReadOptions) -> bool:
     """Whether the poses are to be estimated from the images: `--poses odometry`, and no file is called so."""
-    return options.poses == Path("odometry") and not options.poses.is_file()
+    path = options.poses
+    return path is not None and path == Path("odometry") and not path.is_file()
 
 
 def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False) -> PoseTrack:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
-import cv2
 import jax
 import numpy as np
 from jaxtyping import Float64
@@ -19,10 +18,10 @@ from jaxmap.geometry.options import PlaneFitOptions
 from jaxmap.geometry.plane import fit_plane_mlesac
 from jaxmap.host.prefetch import prefetch
 from jaxmap.localisation.bundle import triangulate
-from jaxmap.localisation.features import View, make_view
+from jaxmap.localisation.features import View, coarse_scale, make_view, shrunk
 from jaxmap.localisation.odometry import LEAST_POINTS, MOST_BRIDGED, StereoOdometry, Track
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image
-from jaxmap.types import Pinhole, StereoCamera, pinhole
+from jaxmap.types import Pinhole, Plane, StereoCamera, pinhole
 
 MOST_COLUMNS = 1600
 """Larger images are shrunk: a point is found to a tenth of a pixel, and that is enough."""
@@ -156,11 +155,7 @@ def _read(sequence: StereoSequence, rig: _Rig, index: int) -> View | FrameError 
             rectify_image(image, maps)
             for image, maps in zip(images, (rig.rectifier.left_maps, rig.rectifier.right_maps), strict=True)
         ]
-    if rig.scale > 1:
-        height, width = (length // rig.scale * rig.scale for length in images[0].shape[:2])
-        by = dict(fx=1 / rig.scale, fy=1 / rig.scale, interpolation=cv2.INTER_AREA)
-        images = [cv2.resize(image[:height, :width], None, **by) for image in images]
-    return make_view(images[0], images[1])
+    return make_view(*(shrunk(image, rig.scale) for image in images))
 
 
 def _fault(sequence: StereoSequence, what: str, fix: str) -> JaxmapError:
@@ -269,17 +264,16 @@ class _Grounds:
         return Ground(up, float(np.median(heights)), len(normals), float(np.median(off)))
 
 
-@partial(jax.jit, static_argnames=())
-def _fit(points: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+@jax.jit
+def _fit(points: jax.Array, valid: jax.Array) -> Plane:
     up_hint = jax.numpy.array([0.0, -1.0, 0.0])
-    return tuple(fit_plane_mlesac(jax.random.key(0), points, valid, up_hint=up_hint, options=_GROUND))
+    return fit_plane_mlesac(jax.random.key(0), points, valid, up_hint=up_hint, options=_GROUND)
 
 
 def _ground_plane(camera: Pinhole, view: View) -> tuple[np.ndarray, float] | None:
     """The normal of the ground in the camera's frame, and the camera's height above it."""
     disparity = view.disparity_px
-    shape, full = np.array(disparity.shape), np.array(view.left.shape)
-    row, column = (np.indices(disparity.shape).reshape(2, -1) + 0.5) * (full / shape)[:, None] - 0.5
+    row, column = (np.indices(disparity.shape).reshape(2, -1) + 0.5) * coarse_scale(view.left.shape[1]) - 0.5
     points = triangulate(camera, np.column_stack([column, row, column - disparity.ravel()]))
     farthest_m = np.sqrt(GROUND_NOISE_M * camera.baseline_m * camera.fx_px / 0.5)
     valid = np.isfinite(points).all(axis=1) & (points[:, 2] < farthest_m)

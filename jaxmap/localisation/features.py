@@ -5,6 +5,7 @@ Following is by Lucas and Kanade, in pyramids, there and back.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -63,11 +64,23 @@ def _even(grey: np.ndarray) -> np.ndarray | None:
     return cv2.LUT(grey, np.clip(gain * (np.arange(256) - mean) + MEAN_GREY, 0, 255).astype(np.uint8))
 
 
+def coarse_scale(width_px: int) -> int:
+    """How many times images of a width are shrunk where disparities are searched."""
+    return max(1, round(width_px / COARSE_WIDTH_PX))
+
+
+def shrunk(image: np.ndarray, scale: int) -> np.ndarray:
+    """An image `scale` times smaller; rows and columns that do not fill a pixel are left out."""
+    if scale == 1:
+        return image
+    height, width = (length // scale * scale for length in image.shape[:2])
+    return cv2.resize(image[:height, :width], (width // scale, height // scale), interpolation=cv2.INTER_AREA)
+
+
 def _coarse_disparity(left: np.ndarray, right: np.ndarray) -> Float32[np.ndarray, "h w"]:
     """Disparities up to a quarter of the width, by semi-global matching of small images."""
-    scale = max(1, round(left.shape[1] / COARSE_WIDTH_PX))
-    by = dict(fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
-    small = [cv2.resize(image, None, **by) for image in (left, right)]
+    scale = coarse_scale(left.shape[1])
+    small = [shrunk(image, scale) for image in (left, right)]
     searched = max(16, round(small[0].shape[1] / 64) * 16)
     block_px = 5
     engine = cv2.StereoSGBM.create(
@@ -91,8 +104,8 @@ def _coarse_disparity(left: np.ndarray, right: np.ndarray) -> Float32[np.ndarray
 
 def coarse_disparity_at(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N"]:
     """The coarse disparity of pixels (column, row), NaN where unknown."""
-    shape, full = np.array(view.disparity_px.shape), np.array(view.left.shape)
-    row, column = np.clip(((pixels[:, ::-1] + 0.5) * shape / full).astype(int), 0, shape - 1).T
+    scale, shape = coarse_scale(view.left.shape[1]), np.array(view.disparity_px.shape)
+    row, column = np.clip(((pixels[:, ::-1] + 0.5) / scale).astype(int), 0, shape - 1).T
     return view.disparity_px[row, column].astype(np.float64)
 
 
@@ -161,9 +174,15 @@ def follow(
     if not len(pixels):
         return np.zeros((0, 2)), np.zeros(0, bool)
     start, aim = (places.astype(np.float32).reshape(-1, 1, 2) for places in (pixels, guess))
-    by = dict(winSize=(window_px, window_px), maxLevel=levels, criteria=_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-    there, arrived, _ = cv2.calcOpticalFlowPyrLK(source, target, start, aim.copy(), **by)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(target, source, there, there + start - aim, **by)
+    by = partial(
+        cv2.calcOpticalFlowPyrLK,
+        winSize=(window_px, window_px),
+        maxLevel=levels,
+        criteria=_STOP,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    there, arrived, _ = by(source, target, start, aim.copy())
+    back, returned, _ = by(target, source, there, there + start - aim)
     found = there.reshape(-1, 2).astype(np.float64)
     inside = ((found > BORDER_PX) & (found < np.array(target.shape[::-1]) - BORDER_PX)).all(axis=1)
     near = np.abs(back - start).reshape(-1, 2).max(axis=1) < RETURN_PX
@@ -178,10 +197,9 @@ def match_descriptors(
     ORB at half the resolution, each the other's best.
     """
     orb = cv2.ORB.create(count)
-    half = dict(fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    (here, one), (there, other) = (
-        orb.detectAndCompute(cv2.resize(view.left, None, **half), None) for view in (source, target)
-    )
+    # An empty mask is none.
+    none = np.zeros((0, 0), np.uint8)
+    (here, one), (there, other) = (orb.detectAndCompute(shrunk(view.left, 2), none) for view in (source, target))
     if one is None or other is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(one, other)
