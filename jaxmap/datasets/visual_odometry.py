@@ -76,7 +76,7 @@ def with_odometry(
     for frame, read in enumerate(prefetch(partial(_read, sequence, rig), range(len(sequence.frames)), 2, 4)):
         view = None if isinstance(read, FrameError) else read
         unread += isinstance(read, FrameError)
-        if odometry.add(frame, view) and view is not None:
+        if odometry.add(view, sequence.frames[frame].timestamp_s) and view is not None:
             grounds.look(frame, view, odometry.latest())
         on_frame(frame + 1, len(sequence.frames))
     track = odometry.track()

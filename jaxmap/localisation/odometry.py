@@ -12,6 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float64, Int
+from scipy.spatial.transform import Rotation
 
 from jaxmap.localisation.bundle import Bundle, Sightings, adjust, adjust_pose, project, to_camera, to_world, triangulate
 from jaxmap.localisation.features import (
@@ -49,7 +50,7 @@ OFF_PX, FAR_OFF_PX = 2.0, 6.0
 """How far a point may lie off where a pose projects it: followed, and matched by its look alone."""
 
 MOST_BRIDGED = 5
-"""Over so many pairs that match nothing the camera is assumed to keep its motion, at most."""
+"""Where pairs match nothing, the camera is assumed to keep its motion over so many of them, or as long, at most."""
 
 
 class Keyframe(NamedTuple):
@@ -102,23 +103,24 @@ class StereoOdometry:
         self._view: View | None = None
         self._points, self._first_id = np.zeros((0, 3)), 0
         self._poses: list[tuple[int, int, np.ndarray, int]] = []
-        self._motion = np.eye(4)
+        self._times_s: list[float] = []
+        self._motion = np.zeros((2, 3))
         self._pending: tuple[int, View] | None = None
 
-    def add(self, frame: int, view: View | None) -> int:
+    def add(self, view: View | None, timestamp_s: float) -> int:
         """Takes the next pair; None for one that shows nothing.
 
         Returns:
             How many points agree on its pose, 0 where it has none.
         """
+        frame = len(self._times_s)
+        self._times_s.append(timestamp_s)
         if view is None:
             return 0
         if self._view is None:
             return self._begin(frame, view, np.eye(4))
-        gap = frame - self._poses[-1][0]
-        T_before = self.latest()
-        located = self._locate(view, T_before, gap)
-        if located is None and self._pending is not None and gap <= MOST_BRIDGED + 1:
+        located = self._locate(view, self.latest(), self._as_before(frame))
+        if located is None and self._pending is not None:
             located = self._bridge(frame, view)
         if located is None:
             self._pending = frame, view
@@ -149,9 +151,8 @@ class StereoOdometry:
     def _take(self, frame: int, view: View, located: Located) -> int:
         """Records the pose of a pair, and makes it a keyframe where it shows much that is new."""
         last = self._window[-1]
-        steps = frame - self._poses[-1][0]
-        if steps == 1:
-            self._motion = np.linalg.inv(self.latest()) @ located.T_world_camera
+        step = np.linalg.inv(self.latest()) @ located.T_world_camera
+        self._motion = np.stack([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()]) / self._since(frame)
         self._pending = None
         moved_px = float(np.median(np.hypot(*(located.uvr_px - last.uvr_px[located.rows])[:, :2].T)))
         self.moved_px = max(self.moved_px, moved_px)
@@ -167,11 +168,15 @@ class StereoOdometry:
         """Goes on from the last pair that matched nothing, if this one matches that."""
         assert self._pending is not None
         before, view_before = self._pending
+        if self._since(before) > (MOST_BRIDGED + 0.5) * np.median(np.diff(self._times_s)):
+            return None
         kept = self._view, list(self._window), list(self._done), list(self._poses), self._points, self._first_id
-        T = self.latest() @ np.linalg.matrix_power(self._motion, before - self._poses[-1][0])
-        if self._begin(before, view_before, T) and (located := self._locate(view, T, frame - before)) is not None:
-            self.bridged.append(before)
-            return located
+        T = self._as_before(before)
+        if self._begin(before, view_before, T):
+            located = self._locate(view, T, self._as_before(frame))
+            if located is not None:
+                self.bridged.append(before)
+                return located
         self._view, self._window, self._done, self._poses, self._points, self._first_id = kept
         return None
 
@@ -199,10 +204,21 @@ class StereoOdometry:
         self._points = np.concatenate([self._points, to_world(T_world_camera, triangulate(self.camera, new))])
         return Keyframe(T_world_camera, np.concatenate([ids, fresh]), np.concatenate([uvr_px, new]))
 
-    def _locate(self, view: View, T_before: np.ndarray, gap: int) -> Located | None:
+    def _since(self, frame: int) -> float:
+        """Time since the last frame that has a pose."""
+        return self._times_s[frame] - self._times_s[self._poses[-1][0]]
+
+    def _as_before(self, frame: int) -> np.ndarray:
+        """The pose of a frame, if the camera keeps its motion."""
+        shift, turn = self._motion * self._since(frame)
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), shift
+        return self.latest() @ step
+
+    def _locate(self, view: View, T_before: np.ndarray, T_moved: np.ndarray) -> Located | None:
         """The pose of a pair from the points of the last keyframe; None where they do not agree on one."""
         best: Located | None = None
-        for guess in (self._as_before(T_before, gap), lambda: T_before, lambda: self._alike(view)):
+        for guess in (lambda: T_moved, lambda: T_before, lambda: self._alike(view)):
             T = guess()
             if T is None or (located := self._locate_near(view, T)) is None:
                 continue
@@ -211,9 +227,6 @@ class StereoOdometry:
             if len(best.rows) > GOOD_SHARE * best.expected:
                 break
         return best
-
-    def _as_before(self, T_before: np.ndarray, gap: int):
-        return lambda: T_before @ np.linalg.matrix_power(self._motion, gap)
 
     def _locate_near(self, view: View, T_guess: np.ndarray) -> Located | None:
         """The pose near a guess: followed coarsely at first, then from where the pose found so projects the points."""
