@@ -29,6 +29,9 @@ MOST_COLUMNS = 1600
 STANDING_PX = 3.0
 """A camera stands where no points move by more."""
 
+MOST_UNSEEN = 0.1
+"""Share of the frames before which the motion may be unseen."""
+
 GROUND_EVERY_M, GROUND_WITHIN_M, GROUND_FRAMES = 1.0, 30.0, 12
 """The ground is looked for in so many frames at most, so far apart, in the first part of the path."""
 
@@ -181,6 +184,12 @@ def _check(sequence: StereoSequence, track: Track) -> None:
             sequence,
             f"the camera stands still over {count} frames (points move by {track.moved_px:.1f} px)",
             "give a part in which it moves (--start, --stop), or --poses FILE",
+        )
+    if len(track.bridged) > max(2, MOST_UNSEEN * count):
+        raise _fault(
+            sequence,
+            f"at {len(track.bridged)} places in {count} frames no motion is seen",
+            "give a part whose images overlap (--start, --stop), or --poses FILE",
         )
     tail = count - 1 - int(track.frames[-1])
     if tail > MOST_BRIDGED and tail > 0.2 * count:
