@@ -25,6 +25,9 @@ MAX_STEPS = 10
 CONVERGED = 1e-3
 """The iteration ends when a step lowers the cost by a smaller share."""
 
+SETTLED = 1e-5
+"""The pose of one camera is found when a step is smaller, in metres and radians."""
+
 
 class Sightings(NamedTuple):
     """Which camera saw which point where.
@@ -131,7 +134,7 @@ def adjust_pose(
         normal = np.einsum("mri,mrj->ij", by_pose, by_pose) + 1e-9 * np.eye(6)
         step = -np.linalg.solve(normal, np.einsum("mri,mr->i", by_pose, residual))
         T = _moved(T[None], step[None])[0]
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < SETTLED:
             break
     return T
 

@@ -18,6 +18,9 @@ MEAN_GREY, SPREAD_GREY, MOST_GAIN = 110.0, 50.0, 6.0
 LEAST_SPREAD_GREY = 1.0
 """An image that varies less shows nothing: it is black, white or fog."""
 
+LARGE_PX = 600
+"""From this width on, corners and first poses are found at half the resolution."""
+
 COARSE_WIDTH_PX = 256
 """Width at which disparities are searched; the tracker then refines them."""
 
@@ -39,12 +42,23 @@ class View(NamedTuple):
 
     Attributes:
         left, right: grey, of one brightness and contrast.
+        small: the left one, `scale` times smaller: good enough to find corners and a first pose.
         disparity_px: coarse, of the left image at a lower resolution, in pixels of the full one; NaN where unknown.
     """
 
     left: UInt8[np.ndarray, "H W"]
     right: UInt8[np.ndarray, "H W"]
+    small: UInt8[np.ndarray, "SH SW"]
+    scale: int
     disparity_px: Float32[np.ndarray, "h w"]
+
+    def to_small(self, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        """Pixels of the left image in the small one: centres are whole numbers in both."""
+        return (pixels + 0.5) / self.scale - 0.5
+
+    def to_full(self, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        """Pixels of the small image in the left one."""
+        return (pixels + 0.5) * self.scale - 0.5
 
 
 def make_view(left: UInt8[np.ndarray, "H W *rgb"], right: UInt8[np.ndarray, "H W *rgb"]) -> View | None:
@@ -52,7 +66,8 @@ def make_view(left: UInt8[np.ndarray, "H W *rgb"], right: UInt8[np.ndarray, "H W
     made = [_even(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in (left, right)]
     if made[0] is None or made[1] is None:
         return None
-    return View(made[0], made[1], _coarse_disparity(made[0], made[1]))
+    scale = 2 if left.shape[1] >= LARGE_PX else 1
+    return View(made[0], made[1], shrunk(made[0], scale), scale, _coarse_disparity(made[0], made[1]))
 
 
 def _even(grey: np.ndarray) -> np.ndarray | None:
@@ -114,26 +129,29 @@ def find_corners(view: View, known: Float64[np.ndarray, "N 2"], count: int) -> F
 
     Each square of the image takes its strongest corners, few of them: rocks would else take all, and sand get none.
     """
-    height, width = view.left.shape
+    image, known = view.small, view.to_small(known)
+    height, width = image.shape
     cell_px = np.sqrt(height * width * PER_CELL / count)
-    spacing_px = max(5.0, 0.25 * cell_px)
+    spacing_px = max(5.0 / view.scale, 0.25 * cell_px)
     mask = np.zeros((height, width), np.uint8)
     mask[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 255
     for column, row in np.rint(known).astype(int).tolist():
         cv2.circle(mask, (column, row), int(spacing_px), (0,), -1)
-    found = cv2.goodFeaturesToTrack(view.left, 4 * count, 1e-4, spacing_px, mask=mask, blockSize=5)
+    found = cv2.goodFeaturesToTrack(image, 4 * count, 1e-4, spacing_px, mask=mask, blockSize=5)
     if found is None:
         return np.zeros((0, 2))
     corners = found.reshape(-1, 2).astype(np.float64)
     columns = int(width // cell_px) + 1
-    cells = [(places // cell_px).astype(int) @ [1, columns] for places in (known, corners)]
+    cells = [
+        (places.clip(0, [width - 1, height - 1]) // cell_px).astype(int) @ [1, columns] for places in (known, corners)
+    ]
     filled = np.bincount(cells[0], minlength=columns * (int(height // cell_px) + 1)).tolist()
     chosen = []
     for corner, cell in zip(corners, cells[1].tolist(), strict=True):
         if filled[cell] < PER_CELL:
             filled[cell] += 1
             chosen.append(corner)
-    return np.array(chosen).reshape(-1, 2)
+    return view.to_full(np.array(chosen).reshape(-1, 2))
 
 
 def match_right(
@@ -194,15 +212,14 @@ def match_descriptors(
 ) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, "N 2"]]:
     """Pixels of two left images that look alike, wherever they lie: many are wrong, and all are coarse.
 
-    ORB at half the resolution, each the other's best.
+    ORB at the small scale, each the other's best.
     """
     orb = cv2.ORB.create(count)
     # An empty mask is none.
     none = np.zeros((0, 0), np.uint8)
-    (here, one), (there, other) = (orb.detectAndCompute(shrunk(view.left, 2), none) for view in (source, target))
+    (here, one), (there, other) = (orb.detectAndCompute(view.small, none) for view in (source, target))
     if one is None or other is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(one, other)
     found = np.array([[here[pair.queryIdx].pt, there[pair.trainIdx].pt] for pair in pairs]).reshape(-1, 2, 2)
-    found = 2 * found + 0.5
-    return found[:, 0], found[:, 1]
+    return source.to_full(found[:, 0]), target.to_full(found[:, 1])

@@ -233,9 +233,9 @@ class StereoOdometry:
         assert self._view is not None
         keyframe, points = self._window[-1], self._points_of(self._window[-1].ids)
         rows, expected = self._in_view(view, T_guess, points)
-        places = keyframe.uvr_px[rows, :2]
-        pixels, good = follow(self._view.left, view.left, places, expected[:, :2], levels=3, window_px=21)
-        T = self._pose_by_ransac(points[rows[good]], pixels[good], OFF_PX, 200)
+        places, guess = (self._view.to_small(pixels[:, :2]) for pixels in (keyframe.uvr_px[rows], expected))
+        pixels, good = follow(self._view.small, view.small, places, guess, levels=2, window_px=17)
+        T = self._pose_by_ransac(points[rows[good]], view.to_full(pixels[good]), OFF_PX, 200)
         if T is None:
             return None
         rows, expected = self._in_view(view, T, points)
