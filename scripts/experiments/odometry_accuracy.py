@@ -59,7 +59,9 @@ def drift(T_world_camera: np.ndarray, T_true: np.ndarray) -> Drift:
         lasts = np.searchsorted(way_m, way_m + length_m - 1e-6)
         errors += [error(first, last) for first, last in enumerate(lasts.tolist()) if last < len(way_m)]
     tilt = np.arccos(np.clip(T_world_camera[0, 2, :3] @ T_true[0, 2, :3], -1, 1))
-    return Drift(way_m[-1], *error(0, len(way_m) - 1), *np.mean(errors, axis=0), float(np.degrees(tilt)))
+    end, end_turned = error(0, len(way_m) - 1)
+    translation, rotation = np.mean(errors, axis=0).tolist()
+    return Drift(float(way_m[-1]), end, end_turned, translation, rotation, float(np.degrees(tilt)))
 
 
 def true_poses(sequence: StereoSequence, path: Path) -> np.ndarray:
