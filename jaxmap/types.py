@@ -24,6 +24,10 @@ from jaxmap.errors import JaxmapError
 MAX_TENSOR_ELEMENTS = 2**31 - 1
 """Flat indices are int32, so a map tensor holds at most this many numbers."""
 
+MOST_CAMERA_PX, MOST_BASELINE_M = 1e6, 1e4
+"""Focal lengths and principal points, and baselines, beyond these are mistakes; float32 must hold their products."""
+_LEAST = 1e-6
+
 
 def _static() -> dict[str, bool]:
     return {"static": True}
@@ -72,15 +76,19 @@ def make_stereo_camera(
     """Checks and builds a `StereoCamera`; `fy_px` is `fx_px` where it is not given.
 
     Raises:
-        JaxmapError: a number is not finite, or the focal length, baseline or size is not positive.
+        JaxmapError: a number is not finite, or beyond what a camera can have; or the focal length, baseline or size
+            is not positive.
     """
     fy_px = fx_px if fy_px is None else fy_px
     numbers = dict(fx_px=fx_px, fy_px=fy_px, cx_px=cx_px, cy_px=cy_px, baseline_m=baseline_m, doffs_px=doffs_px)
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise JaxmapError(f"{name} is {value}", where=where, fix="give a finite number")
+        most = MOST_BASELINE_M if name == "baseline_m" else MOST_CAMERA_PX
+        if abs(value) > most:
+            raise JaxmapError(f"{name} is {value:g}, no camera has more than {most:g}", where=where, fix="correct it")
     for name in ("fx_px", "fy_px", "baseline_m"):
-        if numbers[name] <= 0:
+        if numbers[name] < _LEAST:
             raise JaxmapError(
                 f"{name} is {numbers[name]:g}, it must be positive",
                 where=where,

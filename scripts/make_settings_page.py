@@ -19,10 +19,13 @@ from typing import Annotated, Any, Literal
 
 import annotated_types
 
+from jaxmap.host import settings
 from jaxmap.runs.config import MapConfig
 from jaxmap.runs.training_plan import TrainConfig
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "settings.md"
+
+_USUAL = {settings.Positive: " > 0", settings.NotNegative: " ≥ 0", settings.AnyNumber: "", settings.Place: ""}
 
 HEAD = """# Settings
 
@@ -31,7 +34,8 @@ Generated from the code by `python scripts/make_settings_page.py`; a test compar
 A setting has one name in three forms: an option `--grid.voxel-size-m 0.1` of the command line, a key `voxel_size_m` in
 the group `grid` of a YAML file (`--config FILE`), and a field in Python. Options override the file. A switch is
 `--fusion.carve` or `--fusion.no-carve`. Unknown keys and values out of range are refused. In the tables, `[a, b)` is
-a range that includes a and excludes b, and – is a setting that is not given.
+a range that includes a and excludes b, and – is a setting that is not given. A number for which no end is named lies
+between -1,000,000 and 1,000,000, and one above 0 at 1e-9 or more.
 """
 
 
@@ -49,6 +53,8 @@ def docstrings(options: type) -> dict[str, str]:
 
 def bounds(metadata: tuple[Any, ...]) -> str:
     """The range of a number, such as ` > 0` or ` in [0, 1)`; empty where it has none."""
+    if metadata and metadata[0] in _USUAL:
+        return _USUAL[metadata[0]]
     lower, upper = (), ()
     for entry in metadata:
         for bound in entry if isinstance(entry, annotated_types.GroupedMetadata) else [entry]:
@@ -62,8 +68,8 @@ def bounds(metadata: tuple[Any, ...]) -> str:
                 case annotated_types.Lt(value):
                     upper = ("<", ")", value)
     if lower and upper:
-        return f" in {lower[1]}{lower[2]}, {upper[2]}{upper[1]}"
-    return "".join(f" {sign} {value}" for sign, _, value in filter(None, (lower, upper)))
+        return f" in {lower[1]}{lower[2]:.9g}, {upper[2]:.10g}{upper[1]}"
+    return "".join(f" {sign} {value:g}" for sign, _, value in filter(None, (lower, upper)))
 
 
 def kind_of(kind: Any) -> str:

@@ -18,6 +18,7 @@ import tyro
 from scenes import write_folder_sequence
 
 from jaxmap.commands import COMMANDS
+from jaxmap.commands.console import SHORT
 from jaxmap.commands.main import main
 from jaxmap.host.cache import cache_folder
 
@@ -109,12 +110,13 @@ def options_of(command: str) -> frozenset[str]:
     module = importlib.import_module(f"jaxmap.commands.{command}")
     kinds = [kind for name, kind in vars(module).items() if name.endswith("Arguments")]
     actions = [action for kind in kinds for action in tyro.extras.get_parser(kind)._actions]
-    return frozenset(option for action in actions for option in action.option_strings) | {"--debug"}
+    return frozenset(option for action in actions for option in action.option_strings) | {"--debug", *SHORT}
 
 
 def map_words(sequence: object, out: object, *more: object) -> list[str]:
     """The command line that maps the scene."""
-    return [str(word) for word in ("map", sequence, "--out", out, *GRID, *more)]
+    labelled = () if any(str(word).startswith(("--labeller", "--config")) for word in more) else ("--labeller", "plane")
+    return [str(word) for word in ("map", sequence, "--out", out, *GRID, *labelled, *more)]
 
 
 @cache

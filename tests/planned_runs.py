@@ -20,6 +20,7 @@ BOUNDS = {"lower_m": [-2.0, 0.0, -0.5], "upper_m": [2.0, 5.2, 1.0]}
 
 def config_of(**settings: object) -> MapConfig:
     tree = config_tree(MapConfig())
+    tree["labeller"] = "plane"
     tree["grid"] |= BOUNDS
     for key, value in settings.items():
         tree[key] = {**tree[key], **value} if isinstance(value, dict) else value

@@ -15,6 +15,8 @@ from jaxmap.errors import UsageError
 
 Arguments = TypeVar("Arguments")
 
+SHORT = {"--relief": ("--relief.combine", "True"), "--no-relief": ("--relief.combine", "False")}
+
 
 def parse(
     kind: type[Arguments], command: str, words: Sequence[str], with_config: Callable[[str], Arguments] | None = None
@@ -30,7 +32,8 @@ def parse(
     defaults = {}
     if with_config is not None and (name := _value_of("--config", words)) is not None:
         defaults["default"] = with_config(name)
-    return tyro.cli(kind, prog=f"jaxmap {command}", args=list(words), **defaults)
+    words = [long for word in words for long in SHORT.get(word, (word,))]
+    return tyro.cli(kind, prog=f"jaxmap {command}", args=words, **defaults)
 
 
 def check_bounds(arguments: object, command: str) -> None:
@@ -41,13 +44,15 @@ def check_bounds(arguments: object, command: str) -> None:
     """
     from pydantic import TypeAdapter, ValidationError
 
+    from jaxmap.host.settings import fault_text
+
     try:
         TypeAdapter(type(arguments)).validate_python(vars(arguments))
     except ValidationError as error:
         faults = []
         for fault in error.errors():
-            option, message = str(fault["loc"][0]).replace("_", "-"), fault["msg"]
-            faults.append(f"--{option} is {fault['input']}: {message[0].lower()}{message[1:]}")
+            option = str(fault["loc"][0]).replace("_", "-")
+            faults.append(f"--{option} is {str(fault['input'])[:60]}: {fault_text(fault['msg'])}")
         raise UsageError("; ".join(faults), fix=f"see jaxmap {command} --help") from error
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from jaxmap.commands.console import Console, parse
 from jaxmap.geometry.options import DepthOptions, GridOptions
-from jaxmap.labellers.options import ReliefOptions
 from jaxmap.runs.config import MapConfig, load_config
 
 if TYPE_CHECKING:
@@ -47,12 +46,11 @@ def demo_rows() -> dict[str, tuple[str, MapConfig]]:
     """The rows: run folder name, then the name of the map and its settings."""
     # In cubes, the shapes of rocks are seen in 3D.
     paper, ours = load_config("chiodini2020"), MapConfig(grid=GridOptions(voxel_size_m=VOXEL_M))
-    both = replace(ours, labeller="deeplab", relief=ReliefOptions(combine=True))
     rows = {
         "plane_chiodini2020": ("MLESAC plane (paper)", replace(paper, labeller="plane")),
         "deeplab_chiodini2020": ("DeepLabv3+ (paper)", replace(paper, labeller="deeplab")),
         "relief": ("relief", replace(ours, labeller="relief")),
-        "relief_deeplab": ("relief + DeepLabv3+", both),
+        "relief_deeplab": ("relief + DeepLabv3+", replace(ours, labeller="deeplab")),
     }
     return {run: (name, replace(config, depth=DepthOptions(max_m=MAX_RANGE_M))) for run, (name, config) in rows.items()}
 
@@ -96,13 +94,15 @@ def _map_and_score(out: Path, name: str, config: MapConfig, truth: Path, console
 
     folder = RunFolder(out)
     plan = plan_run(SAMPLE, config, console.notify)
-    with folder.locked():
-        folder.begin(plan.settings(config), resume=False, overwrite=True)
-        metrics = run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=console.notify, report=False)
-    evaluation, layer = evaluate_run(out, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions())
-    backdrop = read_backdrop(truth / "orthomosaic.tif", evaluation, layer)
-    write_evaluation(folder.scores, folder.errors, evaluation, backdrop)
-    write_report(out)
+    with folder.locked(), folder.writing(plan.settings(config), resume=False, overwrite=True) as work:
+        metrics = run_plan(plan, work, strict=True, checkpoint_every_s=60.0, notify=console.notify, report=False)
+        evaluation, layer = evaluate_run(
+            work.path, [truth / "orthomosaic_labels.tif"], TruthOptions(), ScoringOptions()
+        )
+        evaluation.scores["run"] = str(out)
+        backdrop = read_backdrop(truth / "orthomosaic.tif", evaluation, layer)
+        write_evaluation(work.scores, work.errors, evaluation, backdrop)
+        write_report(work.path)
     row = {**evaluation.scores, **found_rocks(evaluation.scores["rocks"]), **_figures(metrics)}
     return ScoredRun({**row, "run": out.name, "map": name}, evaluation, backdrop)
 

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Interval
 
-from jaxmap.commands.console import Console, parse
+from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.host.output_folder import check_inputs_stay
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
+
+Diameter = Annotated[float, Interval(gt=0, le=1000)]
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class EvaluateArguments:
     """The same as a YAML file of CODE: CLASS."""
     truth_crs: str | None = None
     """Coordinate reference system of the ground truth, in place of its own."""
-    rock_diameters_m: tuple[float, float, float] = (0.3, 0.6, 1.0)
+    rock_diameters_m: tuple[Diameter, Diameter, Diameter] = (0.3, 0.6, 1.0)
     """Diameters of small, medium and large rocks in lists that give none."""
     backdrop: Path | None = None
     """An RGB orthomosaic to draw the errors on."""
@@ -59,8 +62,7 @@ def main(words: Sequence[str]) -> int:
         raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
     if arguments.out is not None and arguments.out.suffix.lower() != ".json":
         raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
-    if min(arguments.rock_diameters_m) <= 0:
-        raise UsageError("a diameter that is not positive", where="--rock-diameters-m", fix="give three in metres")
+    check_bounds(arguments, "evaluate")
 
     from jaxmap.datasets.label_raster import choose_coding
     from jaxmap.datasets.rock_list import SIZE_CLASSES
@@ -72,6 +74,7 @@ def main(words: Sequence[str]) -> int:
     keep_compiled_programs()
     console = Console()
     folder = RunFolder(arguments.run)
+    folder.settle_for_reading()
     out, picture = folder.scores, folder.errors
     if arguments.out is not None:
         out, picture = arguments.out, arguments.out.with_name(f"{arguments.out.stem}_errors.png")

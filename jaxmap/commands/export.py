@@ -33,6 +33,7 @@ def main(words: Sequence[str]) -> int:
     from jaxmap.runs.folder import EXPORTS, RunFolder, write_exports
 
     folder = RunFolder(arguments.run)
+    folder.settle_for_reading()
     voxel_map, attributes = load_map(folder.map)
     formats = tuple(EXPORTS) if arguments.format == "all" else (arguments.format,)
     Console().result(arguments.run, write_exports(folder, voxel_map, attributes, formats))

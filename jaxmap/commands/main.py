@@ -9,8 +9,9 @@ from collections.abc import Sequence
 
 from jaxmap import __version__
 from jaxmap.commands import COMMANDS
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.memory import restart_with_lasting_memory
+from jaxmap.host.streams import lasting_streams, lost_output
 
 LASTING_MEMORY = ("train", "tune", "segment", "map", "demo")
 """Commands that allocate and free the memory of a network at every step: gigabytes in training, hundreds of MiB where
@@ -23,25 +24,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0; 2 for a wrong command line or configuration; 1 for any other error; 130 when interrupted.
     """
+    if arguments is None:
+        lasting_streams()
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
-    if not words or words[0] in ("-h", "--help"):
-        print(_overview())
-        return 0 if words else 2
-    if words[0] in ("-V", "--version"):
-        print(f"jaxmap {__version__}")
-        return 0
-    if words[0] not in COMMANDS:
-        _print_error(f"there is no command {words[0]!r}; choose one of {', '.join(COMMANDS)}")
-        return 2
-    if arguments is None and words[0] in LASTING_MEMORY:
+    if arguments is None and words and words[0] in LASTING_MEMORY:
         restart_with_lasting_memory()
     try:
-        command = importlib.import_module(f"jaxmap.commands.{words[0]}")
-        status = command.main(words[1:]) or 0
+        status = _run(words)
         # Here, so that a closed pipe is noticed before Python exits.
         sys.stdout.flush()
+        if (fault := lost_output()) is not None:
+            _print_error(f"standard output was not written ({fault.strerror}); all files were")
+            return status or 1
         return status
     except JaxmapError as error:
         if debug:
@@ -61,6 +57,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         what = " ".join(str(error).split())[:300] or "no message"
         _print_error(f"{type(error).__name__}: {what}; this is a fault of jaxmap: --debug shows the traceback")
         return 1
+
+
+def _run(words: Sequence[str]) -> int:
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if words else 2
+    if words[0] in ("-V", "--version"):
+        print(f"jaxmap {__version__}")
+        return 0
+    if words[0] not in COMMANDS:
+        raise UsageError(f"there is no command {words[0]!r}", fix=f"choose one of {', '.join(COMMANDS)}")
+    return importlib.import_module(f"jaxmap.commands.{words[0]}").main(words[1:]) or 0
 
 
 def _overview() -> str:

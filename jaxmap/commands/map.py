@@ -10,8 +10,9 @@ from typing import Annotated
 
 import tyro
 
-from jaxmap.commands.console import Console, parse
+from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.errors import UsageError
+from jaxmap.host.settings import NotNegative
 from jaxmap.runs.config import MapConfig, load_config
 
 OUTPUTS = (
@@ -38,8 +39,8 @@ class MapArguments:
     resume: bool = False
     """Resume an interrupted run."""
     overwrite: bool = False
-    """Replace a run that lies in the folder."""
-    checkpoint_every_s: float = 30.0
+    """Replace a run that lies in the folder; it stays until the new one is whole."""
+    checkpoint_every_s: Annotated[float, NotNegative] = 30.0
     """How often the map is saved on the way."""
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
@@ -53,8 +54,7 @@ def main(words: Sequence[str]) -> int:
     config = arguments.settings
     if arguments.resume and arguments.overwrite:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
-    if not arguments.checkpoint_every_s >= 0:
-        raise UsageError(f"--checkpoint-every-s is {arguments.checkpoint_every_s}", fix="give seconds from 0 on")
+    check_bounds(arguments, "map")
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.host.cache import keep_compiled_programs
@@ -70,11 +70,15 @@ def main(words: Sequence[str]) -> int:
     with console.counted("odometry", "frames") as on_frame:
         plan = plan_run(arguments.sequence, config, console.notify, on_frame)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
-    with folder.locked(), console.progress("mapping", len(plan.sequence.frames)) as advance:
-        folder.begin(plan.settings(config), resume=arguments.resume, overwrite=arguments.overwrite)
+    resume, overwrite = arguments.resume, arguments.overwrite
+    with (
+        folder.locked(),
+        folder.writing(plan.settings(config), resume=resume, overwrite=overwrite) as work,
+        console.progress("mapping", len(plan.sequence.frames)) as advance,
+    ):
         metrics = run_plan(
             plan,
-            folder,
+            work,
             strict=config.strict,
             checkpoint_every_s=arguments.checkpoint_every_s,
             notify=console.notify,

@@ -13,9 +13,10 @@ import tyro
 from annotated_types import Interval, MinLen
 
 from jaxmap.commands.console import Console, check_bounds, parse
+from jaxmap.host.settings import Place, count
 
 Adjustable = Literal["poses", "mounting", "baseline", "offset"]
-Positive = Annotated[float, Interval(gt=0, lt=1e4)]
+Positive = Annotated[float, Interval(ge=1e-9, lt=1e4)]
 
 
 @dataclass(frozen=True)
@@ -77,14 +78,14 @@ class RefineArguments:
     """Coordinate reference system of the ground truth, in place of its own."""
     max_pose_gap_s: Positive = 1.0
     """Poses farther apart are not interpolated."""
-    start: int = 0
+    start: Annotated[int, Place] = 0
     """First frame."""
-    stop: int | None = None
+    stop: Annotated[int, Place] | None = None
     """Frame to stop before, from the end if negative; by default the end."""
-    stride: int = 1
+    stride: Annotated[int, count(2**31 - 1)] = 1
     """Use every n-th frame."""
     overwrite: bool = False
-    """Replace an earlier refinement in the folder."""
+    """Replace an earlier refinement in the folder; it stays until the new one is whole."""
 
 
 def main(words: Sequence[str]) -> int:

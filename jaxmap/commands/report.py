@@ -24,6 +24,8 @@ def main(words: Sequence[str]) -> int:
     arguments = parse(ReportArguments, "report", words)
 
     from jaxmap.report.run_page import write_report
+    from jaxmap.runs.folder import RunFolder
 
+    RunFolder(arguments.run).settle_for_reading()
     Console().result(arguments.run, [write_report(arguments.run).name])
     return 0

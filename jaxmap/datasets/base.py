@@ -46,7 +46,8 @@ class StereoPair(NamedTuple):
 class FrameRef:
     """One frame of a sequence: its image files and the time at which the left one was taken.
 
-    `name` is the left image's file name without its suffix; label files have the same name.
+    `name` is the left image's file name without its suffix; label files have the same name. Where images lie in one
+    file together, `left` and `right` only say where: bag, topic, time.
     """
 
     name: str
@@ -166,6 +167,7 @@ def assemble(
     crs: str | None = None,
     notes: Sequence[str] = (),
     read_pair: Callable[[FrameRef], StereoPair] = read_stereo_pair,
+    size_px: tuple[int, int] | None = None,
 ) -> StereoSequence:
     """Joins frames, poses and calibration into a sequence in a z-up world.
 
@@ -185,13 +187,14 @@ def assemble(
         crs: the coordinate reference system of the poses.
         notes: what the reader reports to the user.
         read_pair: reads the images of one frame.
+        size_px: width and height of the images; by default those of the first image file.
 
     Raises:
         JaxmapError: frames out of order, counts that disagree, an image of another size than the
             calibration's, a selection without frames or without poses.
     """
     timestamps_s = np.array([frame.timestamp_s for frame in frames], np.float64)
-    _check_frames(frames, timestamps_s, camera, where)
+    _check_frames(frames, timestamps_s, camera, where, size_px)
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
     assert track.timestamps_s is not None
@@ -250,7 +253,11 @@ def assemble(
 
 
 def _check_frames(
-    frames: Sequence[FrameRef], timestamps_s: np.ndarray, camera: StereoCamera | StereoRig, where: object
+    frames: Sequence[FrameRef],
+    timestamps_s: np.ndarray,
+    camera: StereoCamera | StereoRig,
+    where: object,
+    size_px: tuple[int, int] | None,
 ) -> None:
     """Checks the order of the times, and the size of the images against the calibration."""
     backwards = np.diff(timestamps_s, prepend=-np.inf) <= 0
@@ -261,7 +268,7 @@ def _check_frames(
             where=where,
             fix="correct the times of the frames",
         )
-    width_px, height_px = first_image_size_px((frame.left for frame in frames), where)
+    width_px, height_px = size_px or first_image_size_px((frame.left for frame in frames), where)
     if (width_px, height_px) != (camera.width_px, camera.height_px):
         raise JaxmapError(
             f"images are {width_px}x{height_px} px, the calibration is for {camera.width_px}x{camera.height_px} px",

@@ -10,6 +10,7 @@ import numpy as np
 from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.calibration import pinhole_matrix, read_camera_yaml
 from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.pairing import nearest_pairs
 from jaxmap.datasets.poses import parse_ns
 from jaxmap.datasets.text_files import data_lines, image_size, load_yaml, number_list
 from jaxmap.errors import JaxmapError
@@ -123,24 +124,16 @@ def _paired_frames(mav0: Path) -> tuple[list[FrameRef], int]:
     """The pairs that are each other's nearest in time, and how many images are left over."""
     left_ns, left_images = _image_times_ns(mav0 / "cam0")
     right_ns, right_images = _image_times_ns(mav0 / "cam1")
-    partner = _nearest(right_ns, left_ns)
-    mutual = _nearest(left_ns, right_ns)[partner] == np.arange(len(left_ns))
-    paired = np.flatnonzero(mutual & (np.abs(right_ns[partner] - left_ns) <= PAIR_TOLERANCE_NS))
+    paired, partner, _ = nearest_pairs(left_ns, right_ns, PAIR_TOLERANCE_NS)
     if not len(paired):
         raise JaxmapError(
             "no left and right images lie within 5 ms of each other", where=mav0, fix="check both data.csv files"
         )
     frames = [
-        FrameRef(left_images[i].stem, int(left_ns[i]) / 1e9, left_images[i], right_images[partner[i]]) for i in paired
+        FrameRef(left_images[i].stem, int(left_ns[i]) / 1e9, left_images[i], right_images[j])
+        for i, j in zip(paired, partner, strict=True)
     ]
     return frames, len(left_ns) + len(right_ns) - 2 * len(paired)
-
-
-def _nearest(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The index of the nearest of the sorted knots, for each value."""
-    after = np.searchsorted(knots, values).clip(0, len(knots) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(values - knots[before]) <= np.abs(knots[after] - values), before, after)
 
 
 READER = Reader("euroc", "EuRoC MAV, a folder holding mav0/cam0 and mav0/cam1", recognises, open_euroc)

@@ -33,7 +33,8 @@ from jaxmap.datasets.matlab import read_matlab_calibration
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import JaxmapError
-from jaxmap.host.files import config_folder
+from jaxmap.host.bounded_text import MOST_TEXT_BYTES
+from jaxmap.host.files import config_folder, read_bytes
 from jaxmap.localisation.estimate import estimate_poses, estimate_up
 from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, time_to_nearest
 
@@ -424,10 +425,9 @@ def _read_table(
     path: Path, columns: int, plausible: Callable[[list[float]], bool], *, has_word: bool = False
 ) -> LogTable:
     """The readable lines of a text file in the order of time; `has_word`: the second column is text."""
-    try:
-        lines = [line for line in path.read_bytes().split(b"\n") if line.strip()]
-    except OSError as fault:
-        raise _no_poses(f"no {path.name} ({fault.strerror})", path.parent) from fault
+    if not path.exists():
+        raise _no_poses(f"no {path.name}", path.parent)
+    lines = [line for line in read_bytes(path, MOST_TEXT_BYTES).split(b"\n") if line.strip()]
     times, rows, words = [], [], []
     for line in lines:
         fields = line.decode("utf-8", "replace").split()

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef
 from jaxmap.datasets.images import read_index_image
 from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.host.files import check_regular
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.front_end import StereoFrontEnd
+
+_MOST_HEADER_BYTES, _MOST_FILE_BYTES = 1024, 1 << 34
 
 
 @dataclass(frozen=True)
@@ -38,14 +41,9 @@ class LabelFolder:
             FrameError: the file is missing or damaged, of another size, or holds an unknown class.
         """
         path = self.folder / f"{ref.name}{'.npy' if self.soft else '.png'}"
-        labels = self._read_probabilities(path) if self.soft else self._read_indices(path)
         expected = (front_end.camera.height_px, front_end.camera.width_px)
-        if labels.shape[:2] != expected:
-            raise FrameError(
-                f"the labels are {labels.shape[1]}x{labels.shape[0]} px, the image is {expected[1]}x{expected[0]} px",
-                where=path,
-                fix="label the left image at its own size",
-            )
+        labels = self._read_probabilities(path, *expected) if self.soft else self._read_indices(path)
+        _check_size(labels.shape, expected, path)
         if self.labels_are == "raw":
             labels = front_end.rectify_labels(labels)
         return {"class_probabilities" if self.soft else "labels": labels}
@@ -61,18 +59,24 @@ class LabelFolder:
             )
         return labels
 
-    def _read_probabilities(self, path: Path) -> np.ndarray:
+    def _read_probabilities(self, path: Path, height: int, width: int) -> np.ndarray:
         try:
-            array = np.load(path, allow_pickle=False)
-        except FileNotFoundError as error:
-            raise FrameError("the file is missing", where=path, fix="label every left image") from error
+            check_regular(path, _MOST_FILE_BYTES)
+            with open(path, "rb") as file:
+                shape, dtype = _npy_header(file, path)
+                if len(shape) != 3 or shape[2] != self.class_count or dtype.kind != "f":
+                    fix = f"give floats (H, W, {self.class_count})"
+                    raise FrameError(f"an array {shape} of {dtype}", where=path, fix=fix)
+                _check_size(shape, (height, width), path)
+                file.seek(0)
+                # What the header says is known by now: the array is as large as the image.
+                array = np.lib.format.read_array(file, allow_pickle=False).astype(np.float32)
         except (OSError, ValueError, EOFError) as error:
             raise FrameError(f"not a readable array: {error}", where=path, fix="write it with numpy.save") from error
-        if array.ndim != 3 or array.shape[2] != self.class_count or array.dtype.kind != "f":
-            raise FrameError(
-                f"an array {array.shape} of {array.dtype}", where=path, fix=f"give floats (H, W, {self.class_count})"
-            )
-        array = array.astype(np.float32)
+        except FrameError:
+            raise
+        except JaxmapError as error:
+            raise FrameError(error.what, where=error.where, fix="label every left image") from error
         if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.sum(axis=2).max(initial=0) > 1.01:
             raise FrameError(
                 "the probabilities are not finite, not negative, or sum to more than 1",
@@ -80,6 +84,31 @@ class LabelFolder:
                 fix="write softmax outputs",
             )
         return array
+
+
+def _npy_header(file: BinaryIO, path: Path) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of the array in a .npy file, before anything is allocated for it.
+
+    Raises:
+        FrameError: it is no such file; the header is Python text, and its parser may raise nearly anything.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        shape, _, dtype = read(file, max_header_size=_MOST_HEADER_BYTES)
+    except Exception as error:
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        raise FrameError(f"not a readable array: {reason}", where=path, fix="write it with numpy.save") from error
+    return shape, dtype
+
+
+def _check_size(shape: tuple[int, ...], expected: tuple[int, int], path: Path) -> None:
+    if shape[:2] != expected:
+        raise FrameError(
+            f"the labels are {shape[1]}x{shape[0]} px, the image is {expected[1]}x{expected[0]} px",
+            where=path,
+            fix="label the left image at its own size",
+        )
 
 
 def open_label_folder(

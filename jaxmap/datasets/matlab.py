@@ -8,6 +8,7 @@ struct, such as `stereoParameters`, leaves that struct in the stream with all it
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxmap.errors import JaxmapError
+from jaxmap.host.files import check_regular
 from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
 
 _METRES = {"m": 1.0, "meters": 1.0, "cm": 0.01, "centimeters": 0.01, "mm": 0.001, "millimeters": 0.001, "in": 0.0254}
@@ -28,6 +30,7 @@ _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f
 
 _MATRIX, _CELL, _STRUCT, _CHAR, _OPAQUE = 14, 1, 2, 4, 17
 _NUMERIC = range(6, 16)
+_COMPRESSED, _MOST_BYTES, _PIECE_BYTES = 15, 256 << 20, 1 << 20
 _HEADER = 8
 _MAX_DEPTH = 16
 
@@ -48,12 +51,14 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
     # Imported here: no other reader needs it.
     from scipy.io import loadmat
 
-    if not path.is_file():
-        raise JaxmapError(f"there is no file {path}", fix="check the path")
+    check_regular(path, _MOST_BYTES)
     try:
+        _check_inflated(path)
         content = loadmat(path, simplify_cells=True)
     except NotImplementedError as fault:
         raise JaxmapError("a MAT file of version 7.3", where=path, fix="save it in MATLAB with -v7") from fault
+    except JaxmapError:
+        raise
     except Exception as fault:
         # On damaged files the parser raises nearly anything.
         raise JaxmapError(f"not a MAT file ({type(fault).__name__})", where=path, fix="restore the file") from fault
@@ -70,6 +75,38 @@ def read_matlab_calibration(path: Path, size_px: tuple[int, int]) -> StereoRig:
             "no stereoParameters", where=path, fix="save that object or its toStruct, or write the numbers as YAML"
         )
     return _rig(cameras[0], cameras[1], stereo, size_px, path)
+
+
+def _check_inflated(path: Path) -> None:
+    """Refuses a file that grows beyond bounds when its variables are inflated: megabytes can hold gigabytes of zeros.
+
+    Raises:
+        JaxmapError: it is one.
+        Exception: it is damaged.
+    """
+    total = 0
+    with open(path, "rb") as file:
+        header = file.read(128)
+        order = ">" if header[126:128] == b"MI" else "<"
+        while len(tag := file.read(_HEADER)) == _HEADER:
+            kind, length = struct.unpack(f"{order}2I", tag)
+            end = file.tell() + length
+            engine = zlib.decompressobj() if kind == _COMPRESSED else None
+            total += 0 if engine else length
+            while engine and file.tell() < end and not engine.eof:
+                left = file.read(min(_PIECE_BYTES, end - file.tell()))
+                if not left:
+                    break
+                while left and total <= _MOST_BYTES:
+                    total += len(engine.decompress(left, _PIECE_BYTES))
+                    left = engine.unconsumed_tail
+            if total > _MOST_BYTES:
+                raise JaxmapError(
+                    f"its variables take more than {_MOST_BYTES >> 20} MiB",
+                    where=path,
+                    fix="save the calibration alone",
+                )
+            file.seek(end)
 
 
 def _structs(value: Any) -> Iterator[Mapping[str, Any]]:

@@ -2,13 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from jaxmap.host.settings import Positive, options
+from jaxmap.host.settings import AnyNumber, Place, Positive, count, options
 
 PosesWorld = Literal["auto", "z_up", "camera"]
 """World of a pose file: z up; x right, y down, z forward; or detected from the cameras' up axes."""
+
+Offset = Annotated[float, AnyNumber]
+
+
+@options("bag")
+class BagOptions:
+    """The topics and frames of a ROS bag; found by their names where they are not given."""
+
+    left: str | None = None
+    """Image topic of the left camera."""
+    right: str | None = None
+    """Image topic of the right camera."""
+    left_info: str | None = None
+    """CameraInfo topic of the left camera; by default camera_info beside its images."""
+    right_info: str | None = None
+    """CameraInfo topic of the right camera."""
+    images_are: Literal["auto", "raw", "rectified"] = "auto"
+    """Whether the images are rectified: by default by ROS's names (image_rect*), else by their distortion."""
+    poses: str | None = None
+    """Topic of the poses: Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped, Path, tf or NavSatFix."""
+    child: str | None = None
+    """Frame (of tf) whose poses that topic gives, where its messages do not say so."""
+    attitude: str | None = None
+    """Imu topic whose orientation goes with the positions of NavSatFix."""
+    gps: str | None = None
+    """NavSatFix topic that the poses are turned and moved onto, which georeferences the map (UTM)."""
+    max_pair_gap_s: Annotated[float, Positive] = 0.005
+    """Left and right images farther apart in time make no pair."""
 
 
 @options("")
@@ -23,7 +52,7 @@ class ReadOptions:
     """
 
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder or katwijk."""
+    """The reader: auto, kitti, euroc, folder, katwijk, rosbag, madmax, tartanair or middlebury."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
     poses_world: PosesWorld = "auto"
@@ -32,15 +61,16 @@ class ReadOptions:
     """Camera file in place of the sequence's own."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
-    antenna_m: tuple[float, float, float] | None = None
+    antenna_m: tuple[Offset, Offset, Offset] | None = None
     """Katwijk: the GPS antenna in the IMU frame (x backward, y right, z up), by default 0.221 -0.052 1.5785."""
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631; it goes into the map and the GeoTIFF."""
     max_pose_gap_s: Annotated[float, Positive] = 1.0
     """Poses farther apart are not bridged."""
-    start: int = 0
+    start: Annotated[int, Place] = 0
     """First frame."""
-    stop: int | None = None
+    stop: Annotated[int, Place] | None = None
     """Frame to stop before, from the end if negative; by default the end."""
-    stride: Annotated[int, Positive] = 1
+    stride: Annotated[int, count(2**31 - 1)] = 1
     """Take every so many frames."""
+    bag: BagOptions = field(default_factory=BagOptions)

@@ -161,7 +161,7 @@ def parse_ns(word: str, path: Path, line: int) -> int:
     Raises:
         JaxmapError: it is not one, with the line.
     """
-    if not re.fullmatch(r"[0-9]{1,19}", word):
+    if not re.fullmatch(r"[0-9]{1,19}", word) or int(word) >= 2**63:
         raise JaxmapError(
             f"{word[:40]!r} is not a time in whole nanoseconds", where=f"{path} line {line}", fix="correct the line"
         )

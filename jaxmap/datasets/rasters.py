@@ -13,12 +13,18 @@ from jaxtyping import Bool, Float64, Shaped, UInt8
 
 from jaxmap.datasets.crs import Extent, crs_text, extent_in
 from jaxmap.errors import JaxmapError
+from jaxmap.host.files import check_regular
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
     from rasterio.windows import Window
 
-_MAX_NUMBERS = 2**31
+_MOST_BYTES, _MOST_FILE_BYTES = 4 << 30, 1 << 44
+_PIXEL_BYTES = 12
+"""Of masks and codes that are made of each pixel."""
+_MOST_BLOCK_BYTES = 1 << 30
+"""GDAL reads whole blocks, however small the window is."""
+_FARTHEST, _LEAST_PIXEL = 1e9, 1e-24
 _MARGIN_PX = 2
 
 Colours = dict[int, tuple[int, int, int]]
@@ -77,7 +83,8 @@ def read_window(path: Path, place: Extent, crs: str | None = None, margin: float
     """
     with _opened(path) as raster:
         T_crs_pixel = np.array(raster.transform, np.float64).reshape(3, 3)
-        if np.array_equal(T_crs_pixel, np.eye(3)) or abs(np.linalg.det(T_crs_pixel)) == 0:
+        near = (np.abs(T_crs_pixel) < _FARTHEST).all()
+        if not near or np.array_equal(T_crs_pixel, np.eye(3)) or abs(np.linalg.det(T_crs_pixel)) < _LEAST_PIXEL:
             raise JaxmapError(
                 "the raster is not georeferenced", where=path, fix="give a GeoTIFF, or a world file beside it"
             )
@@ -138,16 +145,17 @@ def read_picture(
 @contextmanager
 def _opened(path: Path) -> Iterator[DatasetReader]:
     import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 
-    if not path.is_file():
+    if not path.exists():
         raise JaxmapError("no such file", where=path, fix="check the path of the raster")
+    check_regular(path, _MOST_FILE_BYTES)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             with rasterio.open(path) as raster:
                 yield raster
-        except RasterioError as error:
+        except (RasterioError, CRSError, UnicodeError) as error:
             raise JaxmapError(
                 "not a readable raster: damaged, cut off or not an image", where=path, fix="give a whole GeoTIFF"
             ) from error
@@ -201,10 +209,17 @@ def _read(raster: DatasetReader, window: Window, path: Path) -> tuple[np.ndarray
     from rasterio.enums import ColorInterp
 
     bands = [index for index, kind in zip(raster.indexes, raster.colorinterp, strict=True) if kind != ColorInterp.alpha]
-    numbers = int(window.width) * int(window.height) * len(bands)
-    if numbers > _MAX_NUMBERS:
+    if not bands:
+        raise JaxmapError("the raster has no band but transparency", where=path, fix="give one with values")
+    number_bytes = max(np.dtype(kind).itemsize for kind in raster.dtypes)
+    size = f"{window.width} x {window.height} pixels of {len(bands)} bands"
+    if window.width * window.height * (len(bands) * number_bytes + _PIXEL_BYTES) > _MOST_BYTES:
+        raise JaxmapError(f"{size} lie over the map", where=path, fix="give the raster at a coarser resolution")
+    if max(height * width for height, width in raster.block_shapes) * number_bytes > _MOST_BLOCK_BYTES:
         raise JaxmapError(
-            f"{numbers:.2g} numbers of the raster lie over the map", where=path, fix="give it at a coarser resolution"
+            "the raster is stored in too large blocks",
+            where=path,
+            fix="write it anew in tiles: gdal_translate -co TILED=YES",
         )
     values = raster.read(bands, window=window)
     valid = raster.dataset_mask(window=window) > 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmap.datasets import euroc, folder, katwijk, kitti
+from jaxmap.datasets import euroc, folder, katwijk, kitti, rosbag
 from jaxmap.datasets.base import OnFrame, Reader, StereoSequence, from_images
 from jaxmap.datasets.crs import check_crs
 from jaxmap.datasets.options import ReadOptions
@@ -15,7 +15,7 @@ from jaxmap.errors import JaxmapError, UsageError
 SAMPLE_PREFIX = "sample:"
 
 READERS: dict[str, Reader] = {
-    reader.name: reader for reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER)
+    reader.name: reader for reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER, rosbag.READER)
 }
 
 
@@ -33,7 +33,7 @@ def register(reader: Reader) -> None:
 def open_sequence(
     source: str | Path, options: ReadOptions | None = None, on_frame: OnFrame = lambda done, total: None
 ) -> StereoSequence:
-    """Opens the folder of one sequence, or `sample:NAME` for a bundled one.
+    """Opens the folder of one sequence, a file that holds one (a bag), or `sample:NAME` for a bundled one.
 
     Args:
         source: the folder or sample.
@@ -54,9 +54,9 @@ def open_sequence(
     if str(source).startswith(SAMPLE_PREFIX):
         return _posed(open_sample(str(source).removeprefix(SAMPLE_PREFIX), options), options, on_frame)
     path = Path(source)
-    if not path.is_dir():
-        what = f"{source} is a file" if path.exists() else f"there is no folder {source}"
-        raise JaxmapError(what, fix="give the folder of one sequence, or sample:NAME")
+    if not path.is_dir() and not (path.is_file() and any(reader.recognises(path) for reader in READERS.values())):
+        what = f"{source} is a file, and no bag" if path.exists() else f"there is no folder {source}"
+        raise JaxmapError(what, fix="give the folder of one sequence, a bag, or sample:NAME")
     reader = READERS[options.dataset] if options.dataset != "auto" else _recognise(path)
     if options.camera is not None and options.camera not in reader.cameras:
         fix = f"choose {' or '.join(reader.cameras)}" if reader.cameras else "leave the option out"

@@ -23,6 +23,7 @@ DEFAULT_DIAMETERS_M: Mapping[str, float] = {"small": 0.3, "medium": 0.6, "large"
 HULL_MARGIN_M = 1.0
 PIXEL_M = 0.02
 _MAX_PIXELS = 2**29
+_FARTHEST, _NARROWEST_M, _WIDEST_M = 1e9, 1e-3, 1e3
 _CIRCLE_POINTS = 16
 _SIZE_NAMES = ("diameter", "diameter_m", "size", "size_m", "footprint_m")
 
@@ -122,9 +123,10 @@ def _read_table(path: Path) -> tuple[np.ndarray, bool]:
             rows[row] = [float(words[column]) for column in wanted]
         except ValueError as error:
             raise JaxmapError(f"{error}"[:80], where=f"{path} line {line}", fix="write x y [diameter]") from error
-        if not np.isfinite(rows[row]).all() or (sized and rows[row, 2] <= 0):
+        far, wide = np.abs(rows[row, :2]).max(), rows[row, 2] if sized else 1.0
+        if not far < _FARTHEST or not _NARROWEST_M <= wide < _WIDEST_M:
             raise JaxmapError(
-                "a number that is not finite, or a diameter that is not positive",
+                "a number that is not finite or beyond the earth, or a diameter that is not positive",
                 where=f"{path} line {line}",
                 fix="correct the line",
             )

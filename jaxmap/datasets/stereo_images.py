@@ -19,8 +19,9 @@ from pydantic.dataclasses import dataclass
 
 from jaxmap.datasets.images import read_deep_image
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import atomic_path
-from jaxmap.host.settings import Positive
+from jaxmap.host.settings import AnyNumber, Positive
 
 DISPARITY_SCALE = 256
 
@@ -40,10 +41,10 @@ class LevelCamera:
 
     fx_px: Annotated[float, Positive]
     fy_px: Annotated[float, Positive]
-    cx_px: float
-    cy_px: float
+    cx_px: Annotated[float, AnyNumber]
+    cy_px: Annotated[float, AnyNumber]
     baseline_m: Annotated[float, Positive]
-    doffs_px: float
+    doffs_px: Annotated[float, AnyNumber]
     up_camera: Annotated[tuple[float, float, float], AfterValidator(_check_unit)]
 
 
@@ -83,7 +84,7 @@ def read_stereo(folder: Path, name: str) -> tuple[Float32[np.ndarray, "H W"], Le
             raise JaxmapError("no such file", where=path, fix="give disparity and camera of an image, or neither")
     coded = read_deep_image(disparity)
     try:
-        found = _CAMERA.validate_json(camera.read_bytes())
-    except (OSError, ValidationError) as fault:
+        found = _CAMERA.validate_python(read_json(camera))
+    except ValidationError as fault:
         raise JaxmapError(f"the camera cannot be read ({str(fault)[:200]})", where=camera) from fault
     return np.where(coded == 0, np.nan, coded.astype(np.float32) / DISPARITY_SCALE).astype(np.float32), found

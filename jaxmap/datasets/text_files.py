@@ -5,33 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from jaxmap.errors import JaxmapError
-
-
-def read_text(path: Path) -> str:
-    """The text of a UTF-8 file (a byte order mark is dropped).
-
-    Raises:
-        JaxmapError: the file is missing, cannot be read, or is not text.
-    """
-    try:
-        with open(path, "rb") as file:
-            data = file.read(4096)
-            # A bag or an image given by mistake is refused before gigabytes are read.
-            if b"\0" not in data:
-                data += file.read()
-    except FileNotFoundError as fault:
-        raise JaxmapError(f"there is no file {path}", fix="check the path") from fault
-    except (OSError, ValueError) as fault:
-        raise JaxmapError(f"the file cannot be read ({fault})", where=path, fix="check the path") from fault
-    try:
-        if b"\0" in data:
-            raise ValueError("it holds zero bytes")
-        return data.decode("utf-8-sig")
-    except ValueError as fault:
-        raise JaxmapError("not a text file", where=path, fix="give a UTF-8 text file") from fault
+from jaxmap.host.bounded_text import read_text, read_yaml
 
 
 def data_lines(path: Path) -> list[tuple[int, str]]:
@@ -45,28 +21,12 @@ def data_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def load_yaml(path: Path) -> dict:
-    """Safe-loads a YAML file whose top level is a mapping.
-
-    OpenCV's header `%YAML:1.0`, invalid in YAML but present in EuRoC's files, is accepted.
+    """Reads a YAML file (`read_yaml`) whose top level is a mapping.
 
     Raises:
-        JaxmapError: the file is missing, is not text, is malformed (with the line), or is not a mapping.
+        JaxmapError: what `read_yaml` refuses, or it is not a mapping.
     """
-    text = read_text(path)
-    if text.startswith("%YAML:"):
-        # The line break is kept, so that errors name the right line.
-        text = "".join(text.partition("\n")[1:])
-    try:
-        content = yaml.safe_load(text)
-    except yaml.MarkedYAMLError as fault:
-        mark = fault.problem_mark or fault.context_mark
-        place = f"{path} line {mark.line + 1}" if mark else path
-        raise JaxmapError(
-            f"malformed YAML ({fault.problem or fault.context})", where=place, fix="correct or restore the file"
-        ) from fault
-    except Exception as fault:
-        # PyYAML's constructors raise ValueError, KeyError, RecursionError and others.
-        raise JaxmapError(f"malformed YAML ({fault})", where=path, fix="correct or restore the file") from fault
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise JaxmapError("no keys and values", where=path, fix="the file must hold `key: value` lines; restore it")
     return content

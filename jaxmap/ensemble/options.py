@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from jaxmap.host.settings import NotNegative, Positive, options
+from jaxmap.host.settings import NotNegative, Positive, count, options
 
 Sigma = Annotated[float, NotNegative]
 
@@ -13,7 +13,7 @@ Sigma = Annotated[float, NotNegative]
 class EnsembleOptions:
     """Members and their spread. A standard deviation of 0 turns its error off."""
 
-    members: Annotated[int, NotNegative] = 0
+    members: Annotated[int, count(1024, least=0)] = 0
     """Maps beside the map, each made with errors of its own; 0 makes none. Each takes as much memory as the occupancy
     and one class of the map."""
     position_sigma_m: Sigma = 0.02
@@ -27,7 +27,7 @@ class EnsembleOptions:
     between frames, they are noise."""
     disparity_sigma_px: Sigma = 0.25
     """Standard deviation of the disparity."""
-    disparity_block_px: Annotated[int, Positive] = 16
+    disparity_block_px: Annotated[int, count(4096)] = 16
     """Edge of the blocks whose pixels share their error of disparity, as neighbours do that were matched together."""
     increment_sigma: Sigma = 0.3
     """Relative standard deviation (log-normal) of what each label, a hit and a miss add to the log-odds."""
@@ -35,5 +35,5 @@ class EnsembleOptions:
     """Relative standard deviation (log-normal) of the temperature of soft labels."""
     label_bias_sigma: Sigma = 1.0
     """Standard deviation of what is added to the logits of each class of soft labels, the same for the whole drive."""
-    at_once: Annotated[int, Positive] = 1
+    at_once: Annotated[int, count(1024)] = 1
     """Members computed together: faster on an accelerator, at the cost of memory. The result is the same."""

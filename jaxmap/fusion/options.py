@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Annotated, Any, Literal
 
-from annotated_types import Le
+from annotated_types import Interval
 
 from jaxmap.errors import UsageError
-from jaxmap.host.settings import NotNegative, Positive, Probability, options
+from jaxmap.host.settings import LARGEST, AnyNumber, NotNegative, Positive, Probability, options
 from jaxmap.labels import ROVER_CLASSES
 
 DEFAULT_PRIORITY, DEFAULT_LEFT_OUT = ("rock",), ("background",)
+Number = Annotated[float, AnyNumber]
+
 RARE, EVEN = 0.05, 0.5
 """Priors of the priority classes, and of the others."""
 
@@ -67,15 +69,15 @@ class FusionOptions(FusionRule):
 
     occupancy_hit: Annotated[float, NotNegative] = 0.85
     """Log-odds that a frame with points in a voxel adds to its occupancy."""
-    occupancy_miss: Annotated[float, Le(0)] = -0.4
+    occupancy_miss: Annotated[float, Interval(ge=-LARGEST, le=0)] = -0.4
     """Log-odds added to the occupancy of a voxel that was seen through."""
     occupancy_prior: Annotated[float, Probability] = 0.5
     """Probability that a voxel is occupied before anything was seen."""
-    class_hit: float = 2.0
+    class_hit: Annotated[float, AnyNumber] = 2.0
     """Log-odds that an observed label adds to its class."""
-    class_miss: float = -2.0
+    class_miss: Annotated[float, AnyNumber] = -2.0
     """Log-odds that an observed label adds to every other class."""
-    class_increments: tuple[tuple[float, ...], ...] | None = None
+    class_increments: tuple[tuple[Number, ...], ...] | None = None
     """The whole matrix, row: observed label, column: class; overrides class_hit and class_miss."""
     class_prior: Annotated[float, Probability] | tuple[Annotated[float, Probability], ...] | None = None
     """Probability of a class before anything was seen; one number, or one per class. By default 0.05 for the priority
@@ -88,7 +90,7 @@ class FusionOptions(FusionRule):
     """A voxel is occupied above this probability."""
     class_threshold: Annotated[float, Probability] | None = None
     """A priority class wins above this probability; by default above its prior: more speaks for it than against."""
-    class_kernel: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    class_kernel: tuple[tuple[tuple[Number, ...], ...], ...] | None = None
     """One odd square a class: how much of the evidence of neighbouring columns counts when the map is read; tune
     --kernel learns it."""
 

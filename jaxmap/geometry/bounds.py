@@ -64,7 +64,9 @@ def check_memory(grid: GridSpec, class_count: int, limit_gib: float, members: in
     span_m = size_m * grid.shape
     # Rounded up to a centimetre, with a voxel to spare along each axis: what is advised must fit.
     fitting_m = np.ceil(size_m * (needed_bytes / limit_bytes) ** (1 / 3) * 100) / 100
-    while 4 * (1 + class_count + 2 * members) * np.prod(np.ceil(span_m / fitting_m) + 1) > limit_bytes:
+    number_bytes = 4 * (1 + class_count + 2 * members)
+    # Ends at a single voxel, where not even that fits.
+    while number_bytes * np.prod(np.ceil(span_m / fitting_m) + 1) > limit_bytes and (fitting_m < span_m).any():
         fitting_m = np.ceil(fitting_m * 1.05 * 100) / 100
     advice = " ".join(f"{edge:g}" for edge in (fitting_m[:1] if np.ptp(fitting_m) == 0 else fitting_m))
     ensemble, fewer = (f" with {members} members", "fewer --ensemble.members, ") if members else ("", "")

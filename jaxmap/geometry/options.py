@@ -6,10 +6,14 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from jaxmap.host.settings import NotNegative, Positive, options
+from jaxmap.errors import UsageError
+from jaxmap.host.settings import LARGEST, AnyNumber, CellSize, NotNegative, Positive, count, options
 
-Edge = Annotated[float, Positive]
-Triple = tuple[float, float, float]
+_MOST_RESIDUALS = 1 << 25
+
+Edge = Annotated[float, Interval(ge=1e-6, le=1e3)]
+Metres = Annotated[float, AnyNumber]
+Triple = tuple[Metres, Metres, Metres]
 
 
 @options("grid")
@@ -27,7 +31,7 @@ class GridOptions:
     """How far automatic bounds reach below the lowest camera."""
     above_camera_m: Annotated[float, Positive] = 2.0
     """How far automatic bounds reach above the highest camera."""
-    max_memory_gib: Annotated[float, Positive] = 2.0
+    max_memory_gib: Annotated[float, Interval(ge=1e-6, le=LARGEST)] = 2.0
     """Larger maps are refused."""
 
 
@@ -53,23 +57,32 @@ class PlaneFitOptions:
     """Range over which points off the plane spread."""
     max_tilt_rad: Annotated[float, Interval(gt=0, le=1.5708)] = 0.6
     """Planes that lean further are walls."""
-    hypotheses: Annotated[int, Positive] = 256
+    hypotheses: Annotated[int, count(4096)] = 256
     """Planes tried, each through three points."""
-    sample_points: Annotated[int, Interval(ge=3)] = 8192
+    sample_points: Annotated[int, count(65_536, least=3)] = 8192
     """Points drawn to judge them."""
-    em_rounds: Annotated[int, Positive] = 3
+    em_rounds: Annotated[int, count(100)] = 3
     """Rounds of expectation maximisation."""
     cost: Literal["mlesac", "msac"] = "mlesac"
     """The score of a plane."""
+
+    def __post_init__(self) -> None:
+        """Refuses more residuals than fit a gigabyte."""
+        if self.hypotheses * self.sample_points > _MOST_RESIDUALS:
+            raise UsageError(
+                f"{self.hypotheses} hypotheses of {self.sample_points} sample_points",
+                where="plane",
+                fix=f"take a product of at most {_MOST_RESIDUALS:,}",
+            )
 
 
 @options("relief")
 class GroundOptions:
     """The local ground that relief is measured from (`geometry.relief`)."""
 
-    range_m: Annotated[float, Positive] = 12.8
+    range_m: Annotated[float, Interval(ge=0.1, le=1000)] = 12.8
     """How far ahead the ground is known."""
-    cell_m: Annotated[float, Positive] = 0.1
+    cell_m: Annotated[float, CellSize] = 0.1
     """Edge of a cell of the ground; at long ranges it grows, so that no more than 160 cells lie ahead."""
     rock_m: Annotated[float, Interval(gt=0, le=20)] = 1.5
     """What rises on less than this width is no ground."""
@@ -77,3 +90,12 @@ class GroundOptions:
     """Standard deviation of the neighbourhood that the ground is fitted to."""
     tolerance_m: Annotated[float, Positive] = 0.06
     """How far cells of the ground lie from it, beside their noise."""
+
+    def __post_init__(self) -> None:
+        """Refuses neighbourhoods wider than what is seen."""
+        if max(self.rock_m, self.smooth_m) > self.range_m:
+            raise UsageError(
+                f"rock_m {self.rock_m:g} or smooth_m {self.smooth_m:g} is beyond range_m {self.range_m:g}",
+                where="relief",
+                fix="take smaller ones, or a longer range",
+            )

@@ -1,10 +1,14 @@
-"""Bundled files, and atomic writing: after a crash or on a full disk, a file has its old content or the new one."""
+"""Files: bundled ones; reading regular files alone, within bounds; and atomic writing.
+
+After a crash or on a full disk, a file has its old content or the new one.
+"""
 
 from __future__ import annotations
 
 import errno
 import glob
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -32,6 +36,66 @@ def bundled(name: str) -> Path:
     if not path.exists():
         raise JaxmapError(f"{name} is missing", where=path.parent, fix="install jaxmap anew")
     return path
+
+
+def real_path(path: str | os.PathLike[str]) -> Path:
+    """The path without links; of a link to itself, which `Path.resolve` raises at, as far as it leads."""
+    return Path(os.path.realpath(path))
+
+
+def check_regular(path: Path, most_bytes: int) -> None:
+    """Refuses what is no regular file before it is opened: a pipe would wait for ever, a device may never end.
+
+    Raises:
+        JaxmapError: it is missing, no regular file, cannot be reached, or larger than `most_bytes`.
+    """
+    try:
+        found = os.stat(path)
+    except FileNotFoundError as fault:
+        raise JaxmapError(f"there is no file {path}", fix="check the path") from fault
+    except (OSError, ValueError) as fault:
+        raise _read_error(fault, path) from fault
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, pipe or socket"
+        raise JaxmapError(f"the file cannot be read (it is {kind})", where=path, fix="give a regular file")
+    if found.st_size > most_bytes:
+        raise _too_large(path, most_bytes)
+
+
+def read_bytes(path: Path, most_bytes: int, *, text: bool = False) -> bytes:
+    """The content of a regular file.
+
+    Args:
+        path: the file.
+        most_bytes: that it may hold.
+        text: refuse a file whose first bytes hold a zero: a bag given by mistake, before gigabytes are read.
+
+    Raises:
+        JaxmapError: what `check_regular` refuses, the system refuses, or it is not text.
+    """
+    check_regular(path, most_bytes)
+    try:
+        with open(path, "rb") as file:
+            data = file.read(4096)
+            if not (text and b"\0" in data):
+                # The size is not trusted: files of /proc have none, and others grow.
+                data += file.read(most_bytes + 1 - len(data))
+    except OSError as fault:
+        raise _read_error(fault, path) from fault
+    if text and b"\0" in data:
+        raise JaxmapError("not a text file", where=path, fix="give a UTF-8 text file")
+    if len(data) > most_bytes:
+        raise _too_large(path, most_bytes)
+    return data
+
+
+def _read_error(fault: OSError | ValueError, path: Path) -> JaxmapError:
+    return JaxmapError(f"the file cannot be read ({fault})", where=path, fix="check the path")
+
+
+def _too_large(path: Path, most_bytes: int) -> JaxmapError:
+    most = f"{most_bytes / 2**20:,.0f} MiB" if most_bytes >= 2**20 else f"{most_bytes:,} bytes"
+    return JaxmapError(f"the file is larger than {most}", where=path, fix="check that it is the right one")
 
 
 @contextmanager
@@ -89,18 +153,6 @@ def sync(path: Path) -> None:
             raise
     finally:
         os.close(handle)
-
-
-def remove(path: Path) -> None:
-    """Removes a file, if it is there.
-
-    Raises:
-        JaxmapError: the operating system refused.
-    """
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_error(error, path) from error
 
 
 def write_error(error: OSError, where: object) -> JaxmapError:

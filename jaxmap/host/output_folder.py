@@ -12,7 +12,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.host.files import atomic_path, write_error
+from jaxmap.host.files import atomic_path, real_path, write_error
 
 
 @contextmanager
@@ -60,9 +60,9 @@ def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) ->
     Raises:
         UsageError: an output has the path of an input.
     """
-    read = {path.resolve() for path in inputs if path is not None}
+    read = {real_path(path) for path in inputs if path is not None}
     for path in outputs:
-        if path.resolve() in read:
+        if real_path(path) in read:
             raise UsageError("an input would be overwritten", where=path, fix="choose another --out")
 
 
@@ -73,12 +73,12 @@ def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
         JaxmapError: the file cannot be read.
         UsageError: settings differ; all of them are named.
     """
-    import yaml
+    from jaxmap.host.bounded_text import read_yaml
 
     try:
-        before = yaml.safe_load(path.read_text(encoding="utf8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise JaxmapError(f"cannot be read: {error}", where=path, fix="start anew with --overwrite") from error
+        before = read_yaml(path)
+    except JaxmapError as error:
+        raise JaxmapError(error.what, where=error.where, fix="start anew with --overwrite") from error
     before = before if isinstance(before, dict) else {}
     before, tree = _dotted(before), _dotted(tree)
     differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))

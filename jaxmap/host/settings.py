@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, dataclass_transform
 
 import pydantic.dataclasses
-from annotated_types import Ge, Gt, Interval
+from annotated_types import Interval
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from jaxmap.errors import UsageError
+from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.files import config_folder
 
 Config = TypeVar("Config")
@@ -18,9 +18,23 @@ Config = TypeVar("Config")
 _MOST_NAMED = 6
 """Faults that one message names."""
 
-Positive = Gt(0)
-NotNegative = Ge(0)
+LARGEST = 1e6
+"""No number of metres, pixels, seconds or log-odds that means anything is larger; counts have bounds of their own."""
+
+Positive = Interval(ge=1e-9, le=LARGEST)
+NotNegative = Interval(ge=0, le=LARGEST)
+AnyNumber = Interval(ge=-LARGEST, le=LARGEST)
+CellSize = Interval(ge=1e-3, le=1e3)
+"""Edge of a cell in metres: below, a site has more cells than memory."""
 Probability = Interval(gt=0, lt=1)
+Seed = Interval(ge=0, lt=2**31)
+Place = Interval(ge=-(2**31), lt=2**31)
+"""A place in a sequence, counted from its end where it is negative."""
+
+
+def count(most: int, least: int = 1) -> Interval:
+    """The bounds of a number of things."""
+    return Interval(ge=least, le=most)
 
 
 @dataclass_transform(frozen_default=True)
@@ -73,7 +87,7 @@ class Settings(Generic[Config]):
         Raises:
             UsageError: no such file, not YAML, an unknown key, or a value out of range.
         """
-        import yaml
+        from jaxmap.host.bounded_text import read_yaml
 
         path = Path(name_or_path)
         if not path.exists():
@@ -82,11 +96,9 @@ class Settings(Generic[Config]):
             known = ", ".join(sorted(file.stem for file in self._folder.glob("*.yaml")))
             raise UsageError(f"no config {name_or_path!r}", fix=f"give a YAML file or one of: {known}")
         try:
-            tree = yaml.safe_load(path.read_text(encoding="utf8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise UsageError(f"not YAML: {error}", where=path, fix="correct the file") from error
-        except OSError as error:
-            raise UsageError(f"cannot be read: {error.strerror}", where=path) from error
+            tree = read_yaml(path)
+        except JaxmapError as error:
+            raise UsageError(error.what, where=error.where, fix=error.fix) from error
         if not isinstance(tree or {}, dict):
             raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
         return self.check({key: value for key, value in (tree or {}).items() if key not in self._given}, where=path)
@@ -107,6 +119,12 @@ class Settings(Generic[Config]):
         return self._adapter.dump_python(config, mode="json")
 
 
+def fault_text(message: str) -> str:
+    """What is wrong with a value, in the words of pydantic."""
+    message = message.replace("or equal to 0.000000001", "0, by 1e-9 or more")
+    return message[:1].lower() + message[1:]
+
+
 def _complaints(error: ValidationError, section: str = "") -> str:
     """One clause for each fault, by its dotted key below the section."""
     clauses: dict[str, str] = {}
@@ -119,6 +137,6 @@ def _complaints(error: ValidationError, section: str = "") -> str:
             clauses[key] = f"unknown key {key}"
         else:
             value = repr(fault["input"])
-            clauses.setdefault(key, f"{key} is {value[:60]}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
+            clauses.setdefault(key, f"{key} is {value[:60]}: {fault_text(fault['msg'])}")
     named, more = list(clauses.values())[:_MOST_NAMED], len(clauses) - _MOST_NAMED
     return "; ".join([*named, f"and {more} more"] if more > 0 else named)

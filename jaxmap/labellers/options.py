@@ -10,7 +10,7 @@ from annotated_types import Interval
 
 from jaxmap.errors import UsageError
 from jaxmap.geometry.options import GroundOptions, PlaneFitOptions
-from jaxmap.host.settings import NotNegative, Positive, options
+from jaxmap.host.settings import AnyNumber, NotNegative, Positive, count, options
 
 
 @options("plane")
@@ -29,7 +29,8 @@ class PlaneOptions(PlaneFitOptions):
     """Class of the points off the plane."""
 
     def __post_init__(self) -> None:
-        """Refuses a threshold beyond the points that are kept."""
+        """Refuses a threshold beyond the points that are kept, and what the fit refuses."""
+        super().__post_init__()
         if not self.threshold_m < self.max_height_m:
             raise UsageError(
                 f"threshold_m {self.threshold_m} and max_height_m {self.max_height_m}",
@@ -46,9 +47,10 @@ class ReliefOptions(GroundOptions):
     slope_gain arctan(slope)`. The defaults were fitted on simulated pairs of other worlds than those it is tried on.
     """
 
-    combine: Annotated[bool, tyro.conf.arg(aliases=["--relief"])] = False
-    """Add relief to the labels of a network or of files; --relief for short."""
-    bias: float = -2.7
+    combine: bool | None = None
+    """Add relief to the labels of a network or of files; --relief and --no-relief for short. By default to those of a
+    network that knows the two classes below."""
+    bias: Annotated[float, AnyNumber] = -2.7
     """Log-odds of rock on level ground of middling height."""
     threshold_m: Annotated[float, Interval(ge=0, le=2)] = 0.024
     """Height at which a point is as likely above the ground as on it."""
@@ -62,7 +64,7 @@ class ReliefOptions(GroundOptions):
     """Change of the log-odds for each radian of slope."""
     weight: Annotated[float, NotNegative] = 1.0
     """Share of relief's log-odds that is added to those of other labels."""
-    offset: float = 0.0
+    offset: Annotated[float, AnyNumber] = 0.0
     """Added to relief's log-odds there."""
     label_gain: Annotated[float, NotNegative] = 1.0
     """Factor on the log-odds of the other labels."""
@@ -90,7 +92,7 @@ _RENAMING_OPTION = tyro.constructors.PrimitiveConstructorSpec(
 )
 """A dict of names on the command line; by itself tyro would make an option of each key."""
 
-Size = Annotated[int, Positive]
+Size = Annotated[int, count(8192)]
 
 
 @options("deeplab")

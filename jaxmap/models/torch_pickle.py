@@ -21,7 +21,11 @@ import numpy as np
 
 MAX_AXES = 16
 
+BFLOAT16 = "bf16"
+"""NumPy has no such type: the upper half of a float32."""
+
 _STORAGES = {
+    "BFloat16Storage": BFLOAT16,
     "DoubleStorage": "f8",
     "FloatStorage": "f4",
     "HalfStorage": "f2",
@@ -32,8 +36,17 @@ _STORAGES = {
     "ByteStorage": "u1",
     "BoolStorage": "?",
 }
+_BESIDE = {
+    *("torch", "torchmetrics", "pytorch_lightning", "lightning", "lightning_fabric", "omegaconf", "numpy", "pathlib"),
+    *("argparse", "collections", "datetime", "_codecs", "copyreg", "copy_reg"),
+}
+"""Modules whose values trainers keep beside the tensors (hyperparameters, states of schedulers)."""
+_PLAIN_TYPES = ("list", "dict", "set", "frozenset", "tuple", "slice", "object", "int", "float", "str", "bytearray")
+
 _FUNCTIONS = ("collections.OrderedDict", "torch._utils._rebuild_parameter", "torch._utils._rebuild_tensor_v2")
 _MARK = object()
+_BLANK = object()
+"""Stands for any value that is neither a tensor nor plain; it is not made, whatever the file says of it."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +69,14 @@ class Storage:
     count: int
 
     @property
+    def item_bytes(self) -> int:
+        """The size of a number in the file."""
+        return 2 if self.dtype == BFLOAT16 else np.dtype(self.dtype).itemsize
+
+    @property
     def bytes(self) -> int:
         """The size that the file declares."""
-        return self.count * np.dtype(self.dtype).itemsize
+        return self.count * self.item_bytes
 
 
 class Refused(Exception):
@@ -87,7 +105,7 @@ class StoredTensor:
         last = self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.strides, strict=True))
         if count and (last >= self.storage.count or count > self.storage.count):
             raise Refused(f"a tensor of shape {short(list(self.shape))} in a storage of fewer numbers")
-        return count * np.dtype(self.storage.dtype).itemsize
+        return count * self.storage.item_bytes
 
 
 def short(value: object) -> str:
@@ -98,6 +116,8 @@ def short(value: object) -> str:
 
 def _call(function: object, arguments: object) -> object:
     """The results of the few functions that describe tensors."""
+    if function is _BLANK:
+        return _BLANK
     if not isinstance(function, _Global) or not isinstance(arguments, tuple):
         raise Refused("the file asks to call something that is no function")
     name = str(function)
@@ -115,11 +135,14 @@ def _call(function: object, arguments: object) -> object:
     raise Refused(f"the file asks to call {name} in another way than PyTorch does, which is refused")
 
 
-def _named(module: object, name: object) -> _Global:
+def _named(module: object, name: object) -> object:
     if not isinstance(module, str) or not isinstance(name, str):
         raise Refused("a name that is no text")
     found = _Global(module, name)
     if str(found) not in _FUNCTIONS and not (module == "torch" and name in _STORAGES):
+        plain = module in ("builtins", "__builtin__") and name in _PLAIN_TYPES
+        if plain or module.partition(".")[0] in _BESIDE:
+            return _BLANK
         raise Refused(f"the file asks for {short(found)}, which is refused")
     return found
 
@@ -157,7 +180,10 @@ def interpret(program: bytes | BinaryIO) -> Description:
     for opcode, argument, _ in pickletools.genops(program):
         name = opcode.name
         if name == "STOP":
-            return Description(stack.pop(), storages)
+            content = stack.pop()
+            if content is _BLANK:
+                raise Refused("the file holds an object in place of a dict of tensors, which is refused")
+            return Description(content, storages)
         if name in _IGNORED:
             continue
         if name in _PUSHED:
@@ -197,11 +223,13 @@ def _since_mark(stack: list) -> list:
 def _set_items(stack: list, values: list) -> None:
     if not all(isinstance(key, str | int | float) for key in values[::2]):
         raise Refused("a dict whose keys are neither text nor numbers")
-    stack[-1].update(zip(values[::2], values[1::2], strict=True))
+    if stack[-1] is not _BLANK:
+        stack[-1].update(zip(values[::2], values[1::2], strict=True))
 
 
 def _extend(stack: list, values: list) -> None:
-    stack[-1].extend(values)
+    if stack[-1] is not _BLANK:
+        stack[-1].extend(values)
 
 
 _IGNORED = {"PROTO", "FRAME"}
@@ -227,6 +255,7 @@ _STACK_STEPS: dict[str, Callable[[list], None]] = {
     "TUPLE1": lambda stack: stack.append(tuple(_popped(stack, 1))),
     "TUPLE2": lambda stack: stack.append(tuple(_popped(stack, 2))),
     "TUPLE3": lambda stack: stack.append(tuple(_popped(stack, 3))),
+    "NEWOBJ": lambda stack: stack.append(_call(*_popped(stack, 2))),
     "REDUCE": lambda stack: stack.append(_call(*_popped(stack, 2))),
     "STACK_GLOBAL": lambda stack: stack.append(_named(*_popped(stack, 2))),
     # The state of an OrderedDict is PyTorch's version notes, which are no tensors.

@@ -58,7 +58,7 @@ def write_page(path: Path, title: str, body: str, *, drawn: bool) -> Path:
         JaxmapError: the disk is full or refuses.
     """
     with atomic_path(path) as temporary:
-        temporary.write_text(page(title, body, drawn=drawn), encoding="utf-8")
+        temporary.write_text(page(title, body, drawn=drawn), encoding="utf-8", errors="backslashreplace")
     return path
 
 

@@ -48,7 +48,9 @@ def write_refine_report(out: Path, name: str, state: Refinement, content: dict[s
     ]
     target = out / "report.html"
     with atomic_path(target) as temporary:
-        temporary.write_text(page(f"{name}, refined", "".join(sections), drawn=False), encoding="utf-8")
+        temporary.write_text(
+            page(f"{name}, refined", "".join(sections), drawn=False), encoding="utf-8", errors="backslashreplace"
+        )
     return target
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from jaxmap.datasets.poses import read_poses
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
+from jaxmap.host.bounded_text import YAML_BOUNDS, read_json, read_text
 from jaxmap.labels import class_colours
 from jaxmap.mapping.store import MapAttributes, load_map
 from jaxmap.report.image_colours import SeenFrame, image_colours
@@ -116,11 +116,9 @@ def read_run(run: Path) -> RunContents:
     params, rule = stored_fusion(attributes.fusion, voxel_map.classes, run / "map.zarr")
     path, fix = run / "metrics.json", "finish the run (jaxmap map ... --resume), or bring the file back"
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise JaxmapError("no such file", where=path, fix=fix) from error
-    except (OSError, ValueError) as error:
-        raise JaxmapError(f"not readable as JSON ({error})", where=path, fix=fix) from error
+        metrics = read_json(path)
+    except JaxmapError as error:
+        raise JaxmapError(error.what, where=error.where, fix=fix) from error
     if not isinstance(metrics, dict):
         raise JaxmapError("not a JSON object", where=path, fix=fix)
     trajectory_world, remarks = None, []
@@ -154,7 +152,7 @@ def write_report(run: Path) -> Path:
         if isinstance(entry, dict)
     ]
     config, version = path / "config.yaml", metrics.get("jaxmap_version")
-    text = escape(config.read_text(encoding="utf-8", errors="replace")) if config.is_file() else ""
+    text = _settings(config, remarks)
     settings = f"<details><summary>All settings, as resolved</summary><pre>{text}</pre></details>" if text else ""
     links = "".join(
         f'<li><a href="{quote(name)}">{name}</a><span>{text}</span></li>'
@@ -176,6 +174,17 @@ def write_report(run: Path) -> Path:
         f"<footer>Made by jaxmap{f' {escape(str(version))}' if version else ''}.</footer>",
     ]
     return write_page(path / "report.html", contents.name, "".join(body), drawn=len(contents.voxels.label) > 0)
+
+
+def _settings(config: Path, remarks: list[str]) -> str:
+    """The configuration as it was resolved; left out, with a remark, where it cannot be read."""
+    if not config.exists():
+        return ""
+    try:
+        return escape(read_text(config, YAML_BOUNDS.text_bytes))
+    except JaxmapError:
+        remarks.append(f"{config.name} could not be read and is left out.")
+        return ""
 
 
 def _header(contents: RunContents) -> str:
@@ -236,8 +245,8 @@ def _score_section(run: Path, remarks: list[str]) -> str:
     if not (run / "scores.json").is_file():
         return ""
     try:
-        text = _scores(json.loads((run / "scores.json").read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        text = _scores(read_json(run / "scores.json"))
+    except (JaxmapError, ValueError, KeyError, TypeError, AttributeError):
         remarks.append("scores.json could not be read: the scores are left out.")
         return ""
     image = paper(run / "errors.png", "Rock that was found, falsely called and missed", remarks)

@@ -6,13 +6,11 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Lt
-
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.fusion.options import FusionOptions
 from jaxmap.geometry.options import DepthOptions, GridOptions
-from jaxmap.host.settings import NotNegative, Settings, options
+from jaxmap.host.settings import Seed, Settings, options
 from jaxmap.labellers.options import DeeplabOptions, PlaneOptions, ReliefOptions
 from jaxmap.stereo.match import StereoOptions
 
@@ -23,8 +21,9 @@ LabellerName = Literal["plane", "relief", "deeplab", "files", "none"]
 class MapConfig(ReadOptions):
     """Everything that decides what a map comes out as."""
 
-    labeller: LabellerName = "plane"
-    """What labels the points: the MLESAC plane, relief above the local ground, a network, files, or nothing."""
+    labeller: LabellerName = "deeplab"
+    """What labels the points: a network (with relief beside it), relief above the local ground alone, the MLESAC plane,
+    files, or nothing."""
     model: Path | None = None
     """Model file of the network, with the deeplab labeller (train and weights import write them); by default the
     bundled one, for rovers on sand."""
@@ -40,7 +39,7 @@ class MapConfig(ReadOptions):
     classes are mapped without a class. Each class takes as much memory as the occupancy."""
     strict: bool = False
     """Stop at the first unusable frame instead of going on without it."""
-    seed: Annotated[int, NotNegative, Lt(2**31)] = 0
+    seed: Annotated[int, Seed] = 0
     """Seed of all randomness."""
     grid: GridOptions = field(default_factory=GridOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)

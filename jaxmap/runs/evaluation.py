@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from jaxmap.evaluation.truth_cells import pixel_corners, sample_between
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import top_down
+from jaxmap.host.bounded_text import read_json
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.store import load_map
 from jaxmap.report.error_map import write_error_map
@@ -118,7 +118,7 @@ def read_cameras(run: Path, site_origin: np.ndarray) -> tuple[CameraTrack | None
     folder = RunFolder(run)
     try:
         track = read_poses(folder.poses)
-        metrics = json.loads(folder.metrics.read_text(encoding="utf-8"))
+        metrics = read_json(folder.metrics)
         camera, depth_range_m = metrics["camera"], metrics["grid"]["depth_range_m"]
         T_world_camera = track.T.copy()
         T_world_camera[:, :3, 3] -= site_origin
@@ -130,7 +130,7 @@ def read_cameras(run: Path, site_origin: np.ndarray) -> tuple[CameraTrack | None
             (int(numbers["width"]), int(numbers["height"])),
             float(depth_range_m[1]),
         )
-    except (JaxmapError, OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (JaxmapError, ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
         reason = error if isinstance(error, JaxmapError) else f"{folder.metrics.name} cannot be read"
         return (
             None,

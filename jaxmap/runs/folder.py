@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,11 @@ from jaxmap.export.voxels import occupied_voxels
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
-from jaxmap.host.files import atomic_path
+from jaxmap.host.bounded_text import read_text
+from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
-from jaxmap.mapping.store import MapAttributes, holds_map, load_map
+from jaxmap.host.replacement import Replacement
+from jaxmap.mapping.store import MapAttributes, holds_map, load_map, stray_maps
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
 from jaxmap.report.top_down import missed_picture, top_down_picture
 from jaxmap.runs.log import RunLog
@@ -52,31 +54,64 @@ class RunFolder:
         self.errors = path / "errors.png"
         self.pictures = path / "pictures"
         self.profile = path / "profile"
+        self._replacement = Replacement(path, self._outputs)
 
     def locked(self) -> AbstractContextManager[None]:
         """Keeps other runs out of the folder, see `output_folder.locked`."""
         return locked(self.path)
 
-    def begin(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> None:
+    @contextmanager
+    def writing(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> Iterator[RunFolder]:
+        """Begins a run and yields the folder it is to write into, see `begin`.
+
+        A run that is replaced stays until the block has ended without an error.
+        """
+        work = self.begin(settings, resume=resume, overwrite=overwrite)
+        if work is self:
+            yield self
+            return
+        with self._replacement.written(keep=lambda: holds_map(work.map)):
+            yield work
+
+    def begin(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
         """Writes the resolved settings (`Plan.settings`), or checks that the run here can be resumed with them.
+
+        Returns:
+            Where to write: here, or where a run is replaced, a folder within.
 
         Raises:
             JaxmapError: the folder holds a run already, or files of the same names that are no run's.
             UsageError: the run to be resumed had other settings.
         """
+        self.settle()
+        replacing = RunFolder(self._replacement.new)
         # A run that has failed before its first save has left nothing to lose.
         used = holds_map(self.map) or self.metrics.exists()
-        if used and resume:
-            check_same_settings(self.config, dict(settings))
-            return
-        if used and not overwrite:
+        if resume and (replacing.config.exists() or used):
+            work = replacing if replacing.config.exists() else self
+            check_same_settings(work.config, dict(settings))
+            return work
+        if not overwrite and (used or holds_map(replacing.map)):
             raise JaxmapError(
                 "the folder holds a run already",
                 where=self.path,
                 fix="resume it (--resume), replace it (--overwrite), or choose another folder",
             )
-        self._clear()
-        write_yaml(self.config, dict(settings))
+        self._check_own()
+        self._replacement.discard()
+        if not used:
+            self._clear()
+        work = replacing if used else self
+        write_yaml(work.config, dict(settings))
+        return work
+
+    def settle(self) -> None:
+        """Puts a run in place that was whole when the process that wrote it was killed; the folder must be locked."""
+        self._replacement.settle()
+
+    def settle_for_reading(self) -> None:
+        """`settle`, where no other process writes here."""
+        self._replacement.settle_for_reading()
 
     @property
     def _files(self) -> tuple[Path, ...]:
@@ -97,9 +132,9 @@ class RunFolder:
         Raises:
             UsageError: the folder is the sequence's own, or an output would overwrite an input.
         """
-        here = self.path.resolve()
-        folders = {folder.resolve() for folder in {image.parent for image in images}}
-        if here == Path(source).resolve() or not folders.isdisjoint((here, *here.parents)):
+        here = real_path(self.path)
+        folders = {real_path(folder) for folder in {image.parent for image in images}}
+        if here == real_path(source) or not folders.isdisjoint((here, *here.parents)):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
         check_inputs_stay(self._files, inputs)
 
@@ -108,8 +143,8 @@ class RunFolder:
         if holds_map(self.map):
             return True
         try:
-            return self.config.read_text(encoding="utf8").startswith("sequence:")
-        except (OSError, UnicodeDecodeError):
+            return read_text(self.config).startswith("sequence:")
+        except JaxmapError:
             return False
 
     def resume_point(self) -> tuple[VoxelMap, RunLog] | None:
@@ -123,24 +158,31 @@ class RunFolder:
         voxel_map, attributes = load_map(self.map, members=True)
         return voxel_map, RunLog.from_json(attributes.progress, self.map)
 
-    def _clear(self) -> None:
-        """Removes what an earlier run has written, and nothing else."""
-        if not self._is_run():
-            foreign = [file.name for file in self._files if file.exists()]
-            if foreign:
-                raise JaxmapError(
-                    f"{', '.join(foreign)} would be replaced, but no run has written them",
-                    where=self.path,
-                    fix="choose another --out",
-                )
-            return
-        for folder in (self.map, self.profile):
-            shutil.rmtree(folder, ignore_errors=True)
-        for file in self._files:
-            file.unlink(missing_ok=True)
+    def _check_own(self) -> None:
+        """Checks that the files to be replaced are a run's.
+
+        Raises:
+            JaxmapError: they are not.
+        """
+        foreign = [] if self._is_run() else [file.name for file in self._files if file.exists()]
+        if foreign:
+            raise JaxmapError(
+                f"{', '.join(foreign)} would be replaced, but no run has written them",
+                where=self.path,
+                fix="choose another --out",
+            )
+
+    def _outputs(self) -> Iterator[Path]:
+        """What an earlier run has written, and nothing else."""
+        yield from (self.map, *stray_maps(self.map), self.profile, *self._files)
         for picture in self.pictures.glob("*.png"):
             if _PICTURE_NAME.fullmatch(picture.name):
-                picture.unlink()
+                yield picture
+
+    def _clear(self) -> None:
+        if self._is_run():
+            for path in [*self._outputs()]:
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def write_poses(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from jaxmap.errors import JaxmapError
@@ -13,7 +14,11 @@ from jaxmap.mapping.sequence import FusedFrame
 
 MOST_KEPT = 2048
 
-_STRICT = ConfigDict(extra="forbid")
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+Count = Annotated[int, Interval(ge=0, le=2**62)]
+Number = Annotated[float, Interval(ge=-1e15, le=1e15)]
+Seconds = Annotated[float, Interval(ge=0, le=1e15)]
 
 
 @dataclass
@@ -29,10 +34,10 @@ class Sample:
 
     __pydantic_config__ = _STRICT
 
-    kept: list[float] = field(default_factory=list)
-    stride: int = 1
-    count: int = 0
-    total: float = 0.0
+    kept: list[Number] = field(default_factory=list)
+    stride: Annotated[int, Interval(ge=1, le=2**62)] = 1
+    count: Count = 0
+    total: Number = 0.0
 
     def add(self, number: float) -> None:
         """Takes one more."""
@@ -70,16 +75,16 @@ class RunLog:
 
     __pydantic_config__ = _STRICT
 
-    next_index: int = 0
-    fused: int = 0
+    next_index: Count = 0
+    fused: Count = 0
     skipped: list[dict[str, str]] = field(default_factory=list)
     stages_ms: dict[str, Sample] = field(default_factory=dict)
     valid_fractions: Sample = field(default_factory=Sample)
-    points_fused: int = 0
-    without_ground: int | None = None
-    total_s: float = 0.0
-    compile_s: float = 0.0
-    temporary_bytes: int = 0
+    points_fused: Count = 0
+    without_ground: Count | None = None
+    total_s: Seconds = 0.0
+    compile_s: Seconds = 0.0
+    temporary_bytes: Count = 0
     digest: str = ""
     complete: bool = False
 

@@ -81,13 +81,14 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
+            if fused.info is not None and fused.prepared.index in plan.key_frames:
+                # Pictures are no part of the pipeline that is timed, and wait for the next save. Noted before the
+                # frame counts as done: an interrupt in between must not lose them.
+                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             log.add(fused)
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
-            if fused.info is not None and fused.prepared.index in plan.key_frames:
-                # Pictures are no part of the pipeline that is timed, and wait for the next save.
-                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 _write_key_frames(plan, folder, key_frames)
@@ -96,8 +97,8 @@ def run_plan(
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
-            save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             _write_key_frames(plan, folder, key_frames)
+            save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:

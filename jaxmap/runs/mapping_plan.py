@@ -23,7 +23,7 @@ from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
 from jaxmap.geometry.options import GridOptions, Triple
-from jaxmap.host.files import bundled
+from jaxmap.host.files import bundled, real_path
 from jaxmap.labellers.base import Labeller, make_no_labeller
 from jaxmap.labellers.deeplab import make_deeplab_labeller
 from jaxmap.labellers.files import make_files_labeller
@@ -163,7 +163,7 @@ def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None
         if config.model is not None:
             raise UsageError(
                 f"--model is given, but the labeller is {config.labeller}",
-                fix="add --labeller deeplab, or leave it out",
+                fix="take --labeller deeplab, or leave it out",
             )
         return None, None
     path = config.model or bundled("rover.safetensors")
@@ -213,10 +213,12 @@ def choose_labeller(
         deeplab, shrink = config.deeplab, BUNDLED_WIDTH_PX / camera.width_px
         if config.model is None and deeplab.size_px is None and shrink < 1:
             deeplab = replace(deeplab, size_px=(round(shrink * camera.height_px), BUNDLED_WIDTH_PX))
-        return _with_relief(make_deeplab_labeller(network, classes, deeplab), config)
+        labeller = make_deeplab_labeller(network, classes, deeplab)
+        known = {config.relief.ground, config.relief.rock} <= set(labeller.classes)
+        return _with_relief(labeller, config, by_default=known)
     classes = ROVER_CLASSES if classes is None else classes
     if label_folder is not None:
-        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config)
+        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config, by_default=False)
     if config.labeller == "relief":
         return make_relief_labeller(classes, config.relief)
     if config.labeller == "plane":
@@ -224,8 +226,9 @@ def choose_labeller(
     return make_no_labeller()
 
 
-def _with_relief(labeller: Labeller, config: MapConfig) -> Labeller:
-    return combine_with_relief(labeller, config.relief) if config.relief.combine else labeller
+def _with_relief(labeller: Labeller, config: MapConfig, *, by_default: bool) -> Labeller:
+    combine = by_default if config.relief.combine is None else config.relief.combine
+    return combine_with_relief(labeller, config.relief) if combine else labeller
 
 
 Notify = Callable[[str], None]
@@ -324,7 +327,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame =
         ensemble, pose_errors = draw_ensemble(key, fusion_params, timestamps_s, config.ensemble)
 
     return Plan(
-        source=source if source.startswith(SAMPLE_PREFIX) else str(Path(source).resolve()),
+        source=source if source.startswith(SAMPLE_PREFIX) else str(real_path(source)),
         sequence=sequence,
         front_end=front_end,
         labeller=labeller,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -22,9 +21,11 @@ from jaxmap.datasets.poses import write_tum
 from jaxmap.datasets.rasters import read_heights
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.geometry.bounds import usable_depth
-from jaxmap.host.files import remove
+from jaxmap.host.bounded_text import read_json
+from jaxmap.host.files import real_path
 from jaxmap.host.output_folder import check_inputs_stay, locked, write_json
 from jaxmap.host.prefetch import prefetch
+from jaxmap.host.replacement import Replacement
 from jaxmap.refinement.frames import DisparityFrame, make_disparity_frame
 from jaxmap.refinement.ground import GroundRaster
 from jaxmap.refinement.refine import GroundReference, Refinement, refine, results
@@ -98,8 +99,10 @@ def run_refine(
     Raises:
         JaxmapError: inputs that cannot be used, other files in the folder, or failed writing.
     """
-    with locked(out):
-        check_replaceable(out, overwrite=overwrite)
+    replacement = Replacement(out, lambda: [out / name for name in (*OUTPUTS, CALIBRATION)])
+    replacement.settle_for_reading()
+    check_replaceable(out, overwrite=overwrite)
+    with locked(out), replacement.place(RESULTS, notify) as work:
         inputs = read_inputs(source, options, advance)
         for note in inputs.sequence.notes:
             notify(f"note: {note}")
@@ -110,18 +113,14 @@ def run_refine(
         content: dict[str, Any] = {}
 
         def write(state: Refinement) -> None:
-            if not content:
-                # The results stay until they are replaced: they mark the folder as a refinement's.
-                for name in {*OUTPUTS, CALIBRATION} - {RESULTS}:
-                    remove(out / name)
             content.clear()
             content.update(results(state, inputs.T_world_camera, prior))
             content["frames"] = [frame.name for frame in sequence.frames]
             content["skipped"] = inputs.skipped
             content["notes"] = [*notes, *state.notes]
             content["seconds"] = round(inputs.seconds + time.perf_counter() - started_s, 1)
-            write_json(out / RESULTS, content)
-            _write_poses(out, state, inputs, prior)
+            write_json(work / RESULTS, content)
+            _write_poses(work, state, inputs, prior)
 
         state = refine(
             inputs.frames,
@@ -133,7 +132,7 @@ def run_refine(
             advance=lambda done, note: advance(READING + (1 - READING) * done / (3 * len(inputs.frames)), note),
             on_round=write,
         )
-        write_refine_report(out, sequence.name, state, content)
+        write_refine_report(work, sequence.name, state, content)
         return content
 
 
@@ -143,7 +142,7 @@ def check_inputs_apart(source: str, out: Path, inputs: Iterable[Path | None]) ->
     Raises:
         UsageError: the folder is the sequence's own, or an output would overwrite an input.
     """
-    if out.resolve() == Path(source).resolve():
+    if real_path(out) == real_path(source):
         raise UsageError("the folder is the sequence's own", where=out, fix="choose another --out")
     check_inputs_stay((out / name for name in (*OUTPUTS, CALIBRATION)), inputs)
 
@@ -158,8 +157,8 @@ def check_replaceable(out: Path, *, overwrite: bool) -> None:
     if not there:
         return
     try:
-        earlier = json.loads((out / RESULTS).read_text(encoding="utf8"))
-    except (OSError, ValueError, RecursionError):
+        earlier = read_json(out / RESULTS)
+    except JaxmapError:
         earlier = None
     if not isinstance(earlier, dict) or not earlier.keys() >= {"matches", "map_height_spread_m", "whole_map"}:
         raise JaxmapError(

@@ -5,10 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
-import shutil
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,10 @@ import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxmap.errors import JaxmapError
-from jaxmap.host.files import atomic_path
-from jaxmap.host.output_folder import check_same_settings, write_json, write_yaml
+from jaxmap.host.bounded_text import read_text
+from jaxmap.host.files import atomic_path, real_path
+from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, write_json, write_yaml
+from jaxmap.host.replacement import Replacement
 from jaxmap.models.checkpoint import save_model
 from jaxmap.models.deeplab import Weights
 from jaxmap.report.training_page import TrainingRecord, training_page
@@ -116,44 +117,71 @@ class TrainingFolder:
         self.report = path / "report.html"
         self.config = path / "config.yaml"
         self.checkpoints = path / "checkpoints"
+        self._replacement = Replacement(path, self._outputs)
 
-    def begin(self, plan: TrainingPlan, *, resume: bool, overwrite: bool) -> None:
+    @contextmanager
+    def writing(self, plan: TrainingPlan, *, resume: bool, overwrite: bool) -> Iterator[TrainingFolder]:
+        """Begins a run and yields the folder it is to write into, see `begin`.
+
+        A run that is replaced stays until the block has ended without an error.
+        """
+        work = self.begin(plan, resume=resume, overwrite=overwrite)
+        if work is self:
+            yield self
+            return
+        with self._replacement.written(keep=work.checkpoints.is_dir):
+            yield work
+
+    def begin(self, plan: TrainingPlan, *, resume: bool, overwrite: bool) -> TrainingFolder:
         """Writes the resolved settings, or checks that a run can be resumed.
+
+        Returns:
+            Where to write: here, or where a run is replaced, a folder within.
 
         Raises:
             JaxmapError: the folder already holds a run, or other files of the same names.
             UsageError: the run to be resumed had other settings.
         """
+        self._replacement.settle()
         tree = {
             "training_data": plan.data.source,
-            "init": None if plan.init is None else str(plan.init.resolve()),
+            "init": None if plan.init is None else str(real_path(plan.init)),
             **TRAIN_SETTINGS.tree(plan.config),
         }
-        outputs = (self.model, self.history, self.metrics, self.report, self.config)
-        there = [path.name for path in (*outputs, self.checkpoints) if path.exists()]
+        there = [path.name for path in self._outputs() if path.exists()]
         if there and not self._is_of_training():
             what = f"{', '.join(there)} would be replaced, but no training has written them"
             raise JaxmapError(what, where=self.path, fix="choose another --out")
-        if resume and self.checkpoints.is_dir():
-            check_same_settings(self.config, tree)
-            return
-        if not overwrite and any(path.exists() for path in (self.model, self.history, self.checkpoints)):
+        replacing = TrainingFolder(self._replacement.new)
+        if resume and (replacing.config.exists() or self.checkpoints.is_dir()):
+            work = replacing if replacing.config.exists() else self
+            check_same_settings(work.config, tree)
+            return work
+        used = any(path.exists() for path in (self.model, self.history, self.checkpoints))
+        if not overwrite and (used or replacing.checkpoints.is_dir()):
             what, fix = "the folder holds a training run already", "resume it (--resume), "
             if resume:
                 what, fix = "the training run in the folder has lost its checkpoints", ""
             fix += "replace it (--overwrite), or choose another folder"
             raise JaxmapError(what, where=self.path, fix=fix)
-        for path in outputs:
-            if plan.init is not None and path.resolve() == plan.init.resolve():
-                raise JaxmapError("an input would be overwritten", where=path, fix="choose another --out")
-            path.unlink(missing_ok=True)
-        shutil.rmtree(self.checkpoints, ignore_errors=True)
-        write_yaml(self.config, tree)
+        if plan.init is not None:
+            check_inputs_stay(self._outputs(), [plan.init])
+        self._replacement.discard()
+        if not used:
+            for path in self._outputs():
+                path.unlink(missing_ok=True)
+        work = replacing if used else self
+        write_yaml(work.config, tree)
+        return work
+
+    def _outputs(self) -> tuple[Path, ...]:
+        """What a training writes."""
+        return (self.model, self.history, self.metrics, self.report, self.config, self.checkpoints)
 
     def _is_of_training(self) -> bool:
         try:
-            return self.config.read_text(encoding="utf8").startswith("training_data:")
-        except (OSError, UnicodeDecodeError):
+            return read_text(self.config).startswith("training_data:")
+        except JaxmapError:
             return False
 
     def write_history(self, log: TrainingLog) -> None:
@@ -164,7 +192,7 @@ class TrainingFolder:
         writer.writeheader()
         writer.writerows(log.history)
         with atomic_path(self.history) as temporary:
-            temporary.write_text(text.getvalue(), encoding="utf8")
+            temporary.write_text(text.getvalue(), encoding="utf8", errors="backslashreplace")
 
     def write_report(
         self, plan: TrainingPlan, log: TrainingLog, examples: Sequence[ValidationExample], status: str
@@ -197,7 +225,7 @@ class TrainingFolder:
             )
         )
         with atomic_path(self.report) as temporary:
-            temporary.write_text(page, encoding="utf8")
+            temporary.write_text(page, encoding="utf8", errors="backslashreplace")
         write_json(self.metrics, log.metrics(plan))
 
 

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from annotated_types import Ge, Gt
 
 from jaxmap.errors import UsageError
 from jaxmap.geometry.options import GridOptions
-from jaxmap.host.settings import Settings, options
+from jaxmap.host.files import real_path
+from jaxmap.host.settings import CellSize, NotNegative, Positive, Settings, options
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import load_model
 from jaxmap.models.deeplab import Weights
@@ -33,16 +33,16 @@ from jaxmap.tuning.map_step import MapTrainer
 class MapTruthOptions:
     """How maps are compared with the ground truth, with map supervision."""
 
-    cell_size_m: Annotated[float, Gt(0)] = 0.2
+    cell_size_m: Annotated[float, CellSize] = 0.2
     """Edge of the cells that map and ground truth are compared in."""
     remap: tuple[str, ...] | None = None
     """What the values of the orthomosaic mean, as in evaluate: such as 0=unlabelled 1=sand 2=rock."""
     crs: str | None = None
     """Coordinate reference system of the orthomosaic, in place of its own."""
-    anchor: Annotated[float, Ge(0)] = 1.0
+    anchor: Annotated[float, NotNegative] = 1.0
     """Weight of the loss that holds the network to its initial labels of classes that no orthomosaic shows, such as
     the background."""
-    temperature: Annotated[float, Gt(0)] = 3.0
+    temperature: Annotated[float, Positive] = 3.0
     """Divides the logits before they are fused in training: above 1, confident wrong pixels keep a gradient."""
 
 
@@ -160,12 +160,12 @@ class ImageTrainingData:
     @property
     def source(self) -> str:
         """The folder."""
-        return str(self.training_set.folder.resolve())
+        return str(real_path(self.training_set.folder))
 
     @property
     def title(self) -> str:
         """The folder's name."""
-        return self.training_set.folder.resolve().name
+        return real_path(self.training_set.folder).name
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 import jaxmap
 from jaxmap.errors import UsageError
 from jaxmap.fusion.params import fusion_numbers
-from jaxmap.host.files import atomic_path, remove
+from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import write_json, write_yaml
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.report.tuning_page import tuning_page
@@ -54,10 +54,13 @@ def tuned_config(config: MapConfig, params: TunedParams) -> MapConfig:
     """
     fusion = {name: _rounded(value) for name, value in fusion_numbers(params.fusion).items()}
     config = replace(config, fusion=replace(config.fusion, **fusion))
-    if params.labeller:
-        numbers = {name: _rounded(value) for name, value in params.labeller.items()}
-        section = config.labeller
-        config = replace(config, **{section: replace(getattr(config, section), **numbers)})
+    numbers = {name: _rounded(value) for name, value in params.labeller.items()}
+    # Relief may stand beside another labeller, whose numbers then come first.
+    for section in (config.labeller, "relief"):
+        options = getattr(config, section, None)
+        own = {name: numbers.pop(name) for name in list(numbers) if hasattr(options, name)}
+        if own:
+            config = replace(config, **{section: replace(options, **own)})
     return config
 
 
@@ -276,7 +279,7 @@ class TuningRun:
         }
         write_json(self._out.with_suffix(".json"), result)
         with atomic_path(self._out.with_suffix(".html")) as temporary:
-            temporary.write_text(tuning_page(self._out.stem, result), encoding="utf-8")
+            temporary.write_text(tuning_page(self._out.stem, result), encoding="utf-8", errors="backslashreplace")
         return result
 
     def _stage(self, name: str, before: TunedParams, start: TunedParams, advance: Callable[[int, str], None]) -> _Stage:
@@ -338,9 +341,6 @@ class TuningRun:
         return TunedParams(replace(free.fusion, **fusion), labeller)
 
     def _write_config(self, params: TunedParams) -> None:
-        # Scores and page of an earlier run are of other numbers; those of this one come at its end.
-        for suffix in (".json", ".html"):
-            remove(self._out.with_suffix(suffix))
         write_yaml(self._out, mapping_tree(tuned_config(self._config, params)))
 
     def _part(self, cells: list[ScoredCells], held_out: bool) -> ScoredCells:

@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from jaxmap.datasets.images import read_image
 from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import atomic_path
 from jaxmap.stereo.rectify import StereoRig
 
@@ -90,16 +91,12 @@ def claim_folder(folder: Path, record: Mapping[str, Any]) -> None:
     """
     path = folder / "scene.json"
     fix = "choose another --out, or remove that folder"
-    try:
-        there = json.loads(path.read_text(encoding="utf8"))
-    except FileNotFoundError:
+    if not path.exists():
         if folder.is_dir() and any(folder.iterdir()):
-            raise JaxmapError("the folder holds something else", where=folder, fix=fix) from None
+            raise JaxmapError("the folder holds something else", where=folder, fix=fix)
         write_record(path, record)
         return
-    except (OSError, ValueError) as error:
-        raise JaxmapError(f"cannot be read ({error})", where=path, fix=fix) from error
-    if there != json.loads(json.dumps(record)):
+    if read_json(path) != json.loads(json.dumps(record)):
         raise JaxmapError("the folder holds a data set with other settings", where=folder, fix=fix)
 
 

@@ -6,13 +6,15 @@ import threading
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from annotated_types import Ge, Interval
+from annotated_types import Interval
 
 from jaxmap.errors import FrameError, UsageError
-from jaxmap.host.settings import NotNegative, Positive, options
+from jaxmap.host.settings import NotNegative, count, options
 
 _SUBPIXELS = 16
 _FAR_PX = np.float32(1e6)
+_MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
+"""OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 """Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
@@ -29,37 +31,42 @@ class StereoOptions:
     """Rectification: 0 keeps only pixels valid in both images, 1 keeps all, -1 lets OpenCV choose."""
     mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
-    min_disparity_px: int = 0
+    min_disparity_px: Annotated[int, count(1024, least=-1024)] = 0
     """Smallest disparity searched."""
-    num_disparities: Annotated[int, Positive] | None = None
+    num_disparities: Annotated[int, count(_MOST_DISPARITIES)] | None = None
     """Disparities searched, a multiple of 16; by default an eighth of the image width."""
-    block_size: Annotated[int, Positive] = 7
+    block_size: Annotated[int, count(21)] = 7
     """Edge of the matched block, odd."""
-    p1: Annotated[int, Positive] | None = None
+    p1: Annotated[int, count(_MOST_PENALTY)] | None = None
     """Penalty for a disparity step of one; by default 16 block_size^2, twice what OpenCV suggests: sand has little
     texture."""
-    p2: Annotated[int, Positive] | None = None
+    p2: Annotated[int, count(_MOST_PENALTY)] | None = None
     """Penalty for a greater step; by default 64 block_size^2."""
     pre_filter_cap: Annotated[int, Interval(ge=15, le=63)] = 31
     """Truncation of the image gradient; OpenCV takes 15 at least."""
     uniqueness_ratio: Annotated[int, Interval(ge=0, le=100)] = 10
     """Margin in per cent by which the best match must win."""
-    left_right_max_diff_px: Annotated[int, Ge(-1)] = 1
+    left_right_max_diff_px: Annotated[int, count(_MOST_DISPARITIES, least=-1)] = 1
     """Greatest difference in the left-right check; -1 turns it off."""
-    speckle_window: Annotated[int, NotNegative] | None = None
+    speckle_window: Annotated[int, count(2**30, least=0)] | None = None
     """Blobs of at most so many pixels are dropped; by default an 800th of the image's (983 of 1024 x 768), and at
     least 100; 0 turns it off."""
-    speckle_range_px: Annotated[int, NotNegative] = 2
+    speckle_range_px: Annotated[int, count(_MOST_DISPARITIES, least=0)] = 2
     """Disparity step that ends a blob."""
     edge_step_px: Annotated[float, NotNegative] = 1.5
     """Pixels near a greater step of disparity are dropped: there, blocks smear rocks over the ground behind; 0 keeps
     them."""
-    edge_window_px: Annotated[int, Positive] = 7
+    edge_window_px: Annotated[int, count(255)] = 7
     """Edge of the square, odd, that is near."""
     pad_left: bool = True
     """Match the leftmost columns too."""
 
     def __post_init__(self) -> None:
+        if self.min_disparity_px + (self.num_disparities or 0) > _MOST_DISPARITIES:
+            raise _bad(
+                f"min_disparity_px {self.min_disparity_px} and num_disparities {self.num_disparities} reach too far",
+                f"search to {_MOST_DISPARITIES} at most",
+            )
         if (self.num_disparities or 0) % 16:
             raise _bad(f"num_disparities is {self.num_disparities}", "take a positive multiple of 16")
         if self.left_right_max_diff_px == 0:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxmap.errors import JaxmapError
-from jaxmap.types import StereoCamera, make_stereo_camera
+from jaxmap.types import MOST_CAMERA_PX, StereoCamera, make_stereo_camera
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,8 @@ def make_stereo_rig(
             raise JaxmapError(f"{name} has shape {value.shape}, not {shapes[name]}", where=where)
         if not np.isfinite(value).all():
             raise JaxmapError(f"{name} holds a number that is not finite", where=where)
+        if np.abs(value).max() > MOST_CAMERA_PX:
+            raise JaxmapError(f"{name} holds {np.abs(value).max():g}", where=where, fix="correct the calibration")
     R = arrays["R_right_left"]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise JaxmapError("R_right_left is not a rotation", where=where, fix="check the stereo extrinsics")
@@ -86,7 +88,7 @@ def make_stereo_rig(
     for side in ("K_left", "K_right"):
         if arrays[side][0, 0] <= 0 or arrays[side][1, 1] <= 0:
             raise JaxmapError(f"{side} has a focal length that is not positive", where=where)
-    if not np.isfinite(doffs_px):
+    if not abs(doffs_px) <= MOST_CAMERA_PX:
         raise JaxmapError(f"doffs_px is {doffs_px}", where=where, fix="give a finite number")
     return StereoRig(**arrays, width_px=int(size_px[0]), height_px=int(size_px[1]), doffs_px=float(doffs_px))
 

@@ -17,6 +17,7 @@ from jaxtyping import Float32, Int64, UInt8
 from jaxmap.datasets.images import IMAGE_SUFFIXES, image_size_px, read_image
 from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, stereo_paths
 from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import read_text
 from jaxmap.models.tensor_files import shortened
 from jaxmap.training.masks import (
     UNNAMED,
@@ -348,12 +349,9 @@ def split_names(folder: Path, images: Files, masks: Files, *, validation_share: 
 
 def _listed(path: Path, images: Files, problems: list[str]) -> list[str] | None:
     """The names of a list, or None where there is no list; its faults are added to `problems`."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError) as fault:
-        raise JaxmapError(f"the list cannot be read ({fault})", where=path, fix="write one name a line") from fault
+    lines = read_text(path).splitlines()
     texts = [text for line in lines if (text := re.split(r"(?:^|\s)#", line)[0].strip())]
     names = [_without_suffix(text, images) for text in texts]
     if unknown := sorted({name for name in names if name not in images}):

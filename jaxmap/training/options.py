@@ -5,15 +5,17 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Interval
+from annotated_types import Interval
 from pydantic import BeforeValidator
 
 from jaxmap.errors import UsageError
-from jaxmap.host.settings import options
+from jaxmap.host.settings import NotNegative, Positive, Seed, count, options
 from jaxmap.models.architecture import Backbone
 
-Positive = Annotated[float, Gt(0)]
-NotNegative = Annotated[float, Ge(0)]
+Weight = Annotated[float, Positive]
+WeightOrNone = Annotated[float, NotNegative]
+Factor = Annotated[float, Interval(ge=1 / 64, le=64)]
+Strength = Annotated[float, Interval(ge=0, le=255)]
 Share = Annotated[float, Interval(ge=0, lt=1)]
 Size = Annotated[int, Interval(ge=16, le=4096)]
 MaskValue = Annotated[str, BeforeValidator(str)]
@@ -39,29 +41,29 @@ class AugmentationOptions:
 
     crop_px: tuple[Size, Size] = (384, 384)
     """Height and width of an example."""
-    scale: tuple[Positive, Positive] = (0.75, 1.75)
+    scale: tuple[Factor, Factor] = (0.75, 1.75)
     """Least and greatest factor that images are resized by."""
     class_share: Annotated[float, Interval(ge=0, le=1)] = 0.0
     """Share of the crops that are placed around a pixel of a class, each class of the image as often as the others."""
     mirror: bool = True
     """Mirror every second example."""
-    copies: Annotated[int, Ge(0)] | None = None
+    copies: Annotated[int, count(10_000, least=0)] | None = None
     """Fixed examples made of each image, beside the image itself; by default every example is drawn anew."""
-    brightness: NotNegative = 0.0
+    brightness: Strength = 0.0
     """Brightness is multiplied by up to 1 + this, or divided by it."""
-    contrast: NotNegative = 0.0
+    contrast: Strength = 0.0
     """The same for the distance from the mean level."""
-    saturation: NotNegative = 0.0
+    saturation: Strength = 0.0
     """The same for the distance from grey."""
-    gamma: NotNegative = 0.0
+    gamma: Strength = 0.0
     """The same for the exponent of the tone curve."""
-    hue_rad: NotNegative = 0.0
+    hue_rad: Strength = 0.0
     """Greatest rotation of colours around the grey axis."""
-    tint: NotNegative = 0.0
+    tint: Strength = 0.0
     """Each channel is multiplied by up to 1 + this, or divided by it."""
     grey: Annotated[float, Interval(ge=0, le=1)] = 0.0
     """Share of the examples that are turned to grey."""
-    noise: NotNegative = 0.0
+    noise: Strength = 0.0
     """Standard deviation of added noise, on a scale of 0 to 255."""
     drop_relief: Annotated[float, Interval(ge=0, le=1)] = 0.0
     """Share of the examples whose relief is unknown everywhere, so that the image alone is learnt from, too."""
@@ -84,13 +86,13 @@ class AugmentationOptions:
 class PixelLossOptions:
     """Loss terms of labelled pixels and their weights."""
 
-    cross_entropy: NotNegative = 1.0
+    cross_entropy: WeightOrNone = 1.0
     """Weight of the cross-entropy."""
-    soft_iou: NotNegative = 0.0
+    soft_iou: WeightOrNone = 0.0
     """Weight of one minus the soft intersection over union, mean over classes."""
-    lovasz: NotNegative = 0.0
+    lovasz: WeightOrNone = 0.0
     """Weight of the Lovasz-Softmax loss."""
-    class_weights: Literal["equal", "balanced"] | tuple[Positive, ...] = "equal"
+    class_weights: Literal["equal", "balanced"] | tuple[Weight, ...] = "equal"
     """Weight of each class in the cross-entropy; balanced: by one over the square root of its share of pixels."""
     label_smoothing: Share = 0.0
     """Share of each target distribution that is spread over all classes."""
@@ -106,17 +108,17 @@ class OptimiserOptions:
 
     kind: Literal["adamw", "sgd"] = "adamw"
     """AdamW, or stochastic gradient descent with momentum."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Weight = 1e-3
     """At the start of the poly schedule."""
-    power: NotNegative = 0.9
+    power: WeightOrNone = 0.9
     """Exponent of the poly schedule: rate * (1 - step / steps) ** power."""
-    warmup_steps: Annotated[int, Ge(0)] = 50
+    warmup_steps: Annotated[int, count(1_000_000, least=0)] = 50
     """Steps over which the rate rises from 0."""
-    weight_decay: NotNegative = 1e-4
+    weight_decay: WeightOrNone = 1e-4
     """Of kernels; norms and biases are spared."""
     momentum: Share = 0.9
     """Of stochastic gradient descent."""
-    clip_norm: Positive | None = 5.0
+    clip_norm: Weight | None = 5.0
     """Gradients are clipped to this global norm."""
     backbone_rate: Annotated[float, Interval(ge=0, le=10)] = 1.0
     """Factor on the learning rate of the backbone; 0 freezes it."""
@@ -140,15 +142,15 @@ class BatchNormOptions:
 class TrainingOptions:
     """The training recipe: everything but data and network."""
 
-    epochs: Annotated[int, Gt(0)] = 60
+    epochs: Annotated[int, count(1_000_000)] = 60
     """How often every example is seen."""
-    batch_size: Annotated[int, Gt(0)] = 8
+    batch_size: Annotated[int, count(4096)] = 8
     """Examples in a step."""
-    validate_every: Annotated[int, Gt(0)] = 5
+    validate_every: Annotated[int, count(1_000_000)] = 5
     """Epochs between two validations; the last epoch is always validated."""
     keep: Literal["best", "last"] = "best"
     """The weights written: those with the best mean IoU in validation, or the last ones."""
-    seed: Annotated[int, Interval(ge=0, lt=2**31)] = 0
+    seed: Annotated[int, Seed] = 0
     """Seed of all randomness."""
     augmentation: AugmentationOptions = field(default_factory=AugmentationOptions)
     loss: PixelLossOptions = field(default_factory=PixelLossOptions)

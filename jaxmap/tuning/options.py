@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 import tyro
 from annotated_types import Interval
 
-from jaxmap.host.settings import NotNegative, Positive, options
+from jaxmap.host.settings import CellSize, NotNegative, Positive, Seed, count, options
 
 BLOCK_PX = 4
 """Points this near in the image, and in one voxel, are kept as one; 1 keeps every point."""
@@ -18,11 +18,11 @@ BLOCK_PX = 4
 class DescentOptions:
     """The optimiser: Adam, its learning rate falling to zero along a half cosine."""
 
-    steps: Annotated[int, Positive] = 150
+    steps: Annotated[int, count(1_000_000)] = 150
     """Steps of descent, at most."""
     learning_rate: Annotated[float, Positive] = 0.05
     """Of the descent, in units of the unconstrained numbers; the least, if the loss diverges."""
-    patience: Annotated[int, Positive] = 40
+    patience: Annotated[int, count(1_000_000)] = 40
     """Stop after so many steps without a better held-out loss."""
     max_norm: Annotated[float, Positive, tyro.conf.Suppress] = 10.0
     """Gradients are clipped to this norm."""
@@ -31,9 +31,9 @@ class DescentOptions:
 class Softness(NamedTuple):
     """Widths of the decisions: those of voxels and columns in log-odds, that of cells as a share of their area."""
 
-    occupied: float = 0.1
-    called: float = 0.5
-    cell: float = 0.1
+    occupied: Annotated[float, Positive] = 0.1
+    called: Annotated[float, Positive] = 0.5
+    cell: Annotated[float, Positive] = 0.1
 
 
 @options("tuning")
@@ -66,9 +66,9 @@ class TuneOptions:
     """Learn a kernel of so many columns a side for each class in a second descent, and write it too; 0 for none."""
     frozen: tuple[str, ...] = ()
     """Names of parameters that stay as they are, such as disparity_sigma_px."""
-    cell_size_m: Annotated[float, Positive] = 0.2
+    cell_size_m: Annotated[float, CellSize] = 0.2
     """Edge of the cells that are scored."""
-    block_px: Annotated[int, Positive, tyro.conf.Suppress] = BLOCK_PX
+    block_px: Annotated[int, count(4096), tyro.conf.Suppress] = BLOCK_PX
     """Points this near in the image, and in one voxel, are kept as one."""
-    seed: Annotated[int, tyro.conf.Suppress] = 0
+    seed: Annotated[int, Seed, tyro.conf.Suppress] = 0
     """Of what is held out, and of the bootstrap."""

@@ -40,8 +40,8 @@ HORIZON_PX, RIM_PX = 144, 45
 LABELLERS = {
     "MLESAC plane": {"labeller": "plane"},
     "relief": {"labeller": "relief"},
-    "network sees relief": {"labeller": "deeplab"},
-    "... and --relief (ours)": {"labeller": "deeplab", "relief": ReliefOptions(combine=True)},
+    "network sees relief": {"labeller": "deeplab", "relief": ReliefOptions(combine=False)},
+    "... and relief (ours)": {"labeller": "deeplab"},
 }
 
 

@@ -29,15 +29,15 @@ MATCHERS = {"before": BEFORE, "blocks, penalties": EDGES, "... less edges (now)"
 
 def sources(traverse: Traverse, model: Path | None) -> dict[str, MapConfig]:
     """The settings of each source of labels."""
-    network = traverse.config("deeplab", model=model)
-    both = ReliefOptions(combine=True)
+    ours = traverse.config("deeplab", model=model)
+    blind, alone = DeeplabOptions(see_relief=False), ReliefOptions(combine=False)
     return {
         "MLESAC plane": traverse.config("plane"),
         "relief": replace(traverse.config("plane"), labeller="relief"),
-        "network, image alone": replace(network, deeplab=DeeplabOptions(see_relief=False)),
-        "... and --relief": replace(network, deeplab=DeeplabOptions(see_relief=False), relief=both),
-        "network sees relief": network,
-        "... and --relief (ours)": replace(network, relief=both),
+        "network, image alone": replace(ours, deeplab=blind, relief=alone),
+        "... and relief": replace(ours, deeplab=blind),
+        "network sees relief": replace(ours, relief=alone),
+        "... and relief (ours)": ours,
         "true labels": traverse.config("true"),
     }
 

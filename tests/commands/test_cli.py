@@ -102,8 +102,9 @@ def test_a_switch_can_be_set_to_what_it_is(settings_of):
 
 def test_relief_has_a_short_name(settings_of):
     assert settings_of("--labeller", "deeplab", "--relief").relief.combine is True
-    assert settings_of("--relief.combine", "--relief.weight", "0.5").relief.combine is True
+    assert settings_of("--relief.combine", "True", "--relief.weight", "0.5").relief.combine is True
     assert settings_of("--no-relief").relief.combine is False
+    assert settings_of().relief.combine is None
 
 
 def test_the_place_of_config_among_the_options_does_not_matter(settings_of, tmp_path):

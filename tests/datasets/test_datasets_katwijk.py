@@ -175,7 +175,7 @@ def test_a_part_without_gps_or_imu_needs_poses(part):
     assert refused(part).startswith("613 of 613 lines cannot be read in PART/gps-utm31.txt; restore the file, or")
     (part / "imu.txt").unlink()
     (part / "gps-utm31.txt").write_text("2015_11_26_12_53_34_617 RTK_FIXED 52.2141 4.4003 6.242 0.005 0.004 0.009\n")
-    assert refused(part).startswith("no imu.txt (No such file or directory) in PART; restore the file, or give --poses")
+    assert refused(part).startswith("no imu.txt in PART; restore the file, or give --poses")
 
 
 def test_damaged_lines_are_left_out_sorted_and_counted(part, made):
@@ -271,7 +271,7 @@ def as_pancam(part: Path) -> None:
 def test_pancam_turns_with_pan_and_tilt(part, made):
     as_pancam(part)
     _, truth, frames_s = made
-    assert refused(part, ReadOptions(camera="pancam")).startswith("no ptu.txt (No such file or directory) in PART")
+    assert refused(part, ReadOptions(camera="pancam")).startswith("no ptu.txt in PART")
     pan, tilt = 0.8, 0.3
     lines = [f"{time_text(t)} {pan} {tilt}" for t in np.arange(0, truth.times_s[-1], 0.5)]
     (part / "ptu.txt").write_text("\n".join(lines))

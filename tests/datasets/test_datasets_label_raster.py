@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import rasterio
 from rasterio import Affine
 from rasterio.enums import ColorInterp
 from truth_files import CRS, SITE, class_layer, write_raster
@@ -181,6 +182,26 @@ def test_faults_of_a_raster_are_reported(tmp_path):
         read_label_orthomosaic(plain, PLACE, crs="EPSG:1")
 
 
+def test_a_raster_too_large_for_memory_is_refused_by_its_size(tmp_path):
+    """46,000 x 46,000 numbers in a file of some kilobytes: tiles that are not there."""
+    path = tmp_path / "sparse.tif"
+    profile = dict(driver="GTiff", width=46_000, height=46_000, count=1, dtype="float64", crs=CRS, SPARSE_OK=True)
+    transform = Affine(1e-3, 0, PLACE.west, 0, -1e-3, PLACE.north)
+    with rasterio.open(path, "w", **profile, tiled=True, transform=transform):
+        pass
+    with pytest.raises(JaxmapError, match="46000 x 46000 pixels of 1 bands lie over the map"):
+        read_label_orthomosaic(path, Extent(PLACE.west, PLACE.north - 46, PLACE.west + 46, PLACE.north, CRS))
+    corner = Extent(PLACE.west, PLACE.north - 0.1, PLACE.west + 0.1, PLACE.north, CRS)
+    assert read_label_orthomosaic(path, corner).labels.shape == (102, 102)
+
+
+@pytest.mark.parametrize("numbers", [(1e300, 0, 0, 0, -1, 0), (1e-300, 0, 0, 0, -1e-300, 0), (1, 0, 1e300, 0, -1, 0)])
+def test_a_georeference_beyond_the_earth_is_none(tmp_path, numbers):
+    path = write_raster(tmp_path / "far.tif", np.ones((4, 4), np.uint8), 0, 0, 1, transform=Affine(*numbers))
+    with pytest.raises(JaxmapError, match="not georeferenced"):
+        read_label_orthomosaic(path, PLACE)
+
+
 def test_every_cut_of_a_raster_is_one_line(tmp_path):
     whole = write_raster(tmp_path / "whole.tif", blobs(), WEST, NORTH, 0.05, compress="deflate").read_bytes()
     damaged = tmp_path / "damaged.tif"
@@ -276,6 +297,8 @@ def test_one_rock_alone_and_lists_of_another_system(tmp_path):
         ("1 2 3\n1 b 3\n", "line 2"),
         ("1 nan\n", "not finite"),
         ("1 2 -3\n", "not positive"),
+        ("1 1e30\n", "beyond the earth"),
+        ("1 2 1e-300\n", "not positive"),
         ("east,north\n1,2\n", "the columns are east north"),
         ("1 2\n", "do not lie over the map: they reach from"),
     ],

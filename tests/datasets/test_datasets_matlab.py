@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from io import BytesIO
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
+from jaxmap.datasets import matlab
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.matlab import read_matlab_calibration, structs_of_objects
 from jaxmap.errors import JaxmapError
@@ -124,6 +127,18 @@ def test_what_is_no_calibration_is_reported(tmp_path, content, message):
     path = tmp_path / "stereo.mat"
     savemat(path, content)
     assert refused(path).startswith(message)
+
+
+def test_megabytes_that_hold_gigabytes_are_not_inflated(tmp_path, monkeypatch):
+    """Zeros as a variable beside a calibration, deflated to a thousandth."""
+    monkeypatch.setattr(matlab, "_MOST_BYTES", 4 << 20)
+    path = tmp_path / "stereo.mat"
+    savemat(path, {"s": stereo()}, do_compression=True)
+    engine = zlib.compressobj(1)
+    deflated = engine.compress(bytes(1 << 23)) + engine.flush()
+    with open(path, "ab") as file:
+        file.write(struct.pack("<2I", 15, len(deflated)) + deflated)
+    assert refused(path) == "its variables take more than 4 MiB in FILE; save the calibration alone"
 
 
 def test_what_is_no_mat_file_is_reported(tmp_path):

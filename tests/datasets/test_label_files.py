@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -137,3 +139,49 @@ def test_the_first_frame_distinguishes_which_kind_they_are(tmp_path):
         open_label_folder(tmp_path, 3, "raw", "f002")
     with pytest.raises(JaxmapError, match="no such folder of labels"):
         open_label_folder(tmp_path / "nowhere", 3, "raw", "f000")
+
+
+def npy(header: bytes, data: bytes = b"") -> bytes:
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+HOSTILE_ARRAYS = {
+    "brackets that stay open": npy(b"(" * 60_000),
+    "minus signs": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"-" * 5_000 + b"1,)}\n"),
+    "a shape beyond memory": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000,)}\n"),
+    "the right number of axes, beyond memory": npy(
+        b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 1000000, 3)}\n"
+    ),
+    "no number among huge extents": npy(
+        b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999999999999999999, 0, 3)}\n"
+    ),
+    "negative extents": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-120, -160, 3)}\n"),
+    "objects": npy(b"{'descr': '|O', 'fortran_order': False, 'shape': (120, 160, 3)}\n", b"cos\nsystem\n"),
+    "half of the numbers": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (120, 160, 3)}\n", b"\0" * 1000),
+    "a later version": b"\x93NUMPY\x09\x00" + b"\0" * 100,
+    "an archive": b"PK\x03\x04" + b"\0" * 100,
+    "no header": b"\x93NUMPY",
+}
+
+
+@pytest.mark.parametrize("content", HOSTILE_ARRAYS.values(), ids=HOSTILE_ARRAYS.keys())
+def test_an_array_is_known_by_its_header_before_it_is_read(tmp_path, content):
+    path = tmp_path / "f000.npy"
+    path.write_bytes(content)
+    with pytest.raises(FrameError) as caught:
+        LabelFolder(tmp_path, True, 3, "rectified").read(REF, PLAIN)
+    assert str(path) in str(caught.value) and len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "archive of arrays"])
+def test_probabilities_are_regular_files(tmp_path, kind):
+    path = tmp_path / "f000.npy"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        with open(path, "wb") as file:
+            np.savez(file, one_hot())
+    with pytest.raises(FrameError, match=str(path)):
+        LabelFolder(tmp_path, True, 3, "rectified").read(REF, PLAIN)

@@ -110,5 +110,10 @@ def test_no_count_of_voxels_is_too_large_to_be_refused():
         check_memory(grid, 3, 2.0)
 
 
+def test_a_limit_that_no_map_fits_is_told_too():
+    with pytest.raises(JaxmapError, match="over the limit"):
+        check_memory(make_grid((0, 0, 0), (5, 5, 2), 0.1), 3, 1e-6, members=1024)
+
+
 def test_one_channel_of_float32_for_occupancy_and_each_class():
     assert map_bytes(make_grid((0, 0, 0), (1, 2, 3), 1.0), 3) == 4 * 4 * 6

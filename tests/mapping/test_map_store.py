@@ -262,6 +262,14 @@ def edit_attributes(path: Path, **changes: object) -> None:
         ({"fusion": []}, "fusion is"),
         ({"shape": [5, 4, 9]}, r"float32 \(3, 5, 4, 3\), its attributes say float32 \(3, 5, 4, 9\)"),
         ({"classes": ["sand"]}, r"its attributes say float32 \(2, 5, 4, 3\)"),
+        ({"frames_fused": 2**40}, "frames_fused is 1099511627776"),
+        ({"frames_fused": 1.5}, "frames_fused is 1.5"),
+        ({"frames_fused": 10**400}, "frames_fused is 1000"),
+        ({"voxel_size_m": [1e300, 0.1, 0.1]}, "voxel_size_m is"),
+        ({"voxel_size_m": [1e-300, 0.1, 0.1]}, "voxel_size_m or shape"),
+        ({"site_origin": [1e300, 0, 0]}, "site_origin is"),
+        ({"shape": [10**15, 4, 3]}, "shape is|or shape"),
+        ({"classes": ["x"] * 100_000}, "classes is"),
     ],
 )
 def test_wrong_attributes_are_named(tmp_path, changes, message) -> None:
@@ -271,6 +279,55 @@ def test_wrong_attributes_are_named(tmp_path, changes, message) -> None:
     with pytest.raises(JaxmapError, match=message) as caught:
         load_map(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("shape", [3, 10**15, 4, 3], "GiB, this machine has"),
+        ("chunk_shape", [1, 10**6, 10**6, 10**6], "GiB, this machine has"),
+        ("chunk_shape", [0, 1, 1, 1], "chunks of 0 x 1 x 1 x 1"),
+        ("shape", [-3, 5, 4, 3], "no readable Zarr group"),
+    ],
+)
+def test_an_array_is_known_by_its_form_before_it_is_read(tmp_path, field, value, message) -> None:
+    path = tmp_path / "map.zarr"
+    save_map(path, small_map(), MapAttributes())
+    file = path / "log_odds" / "zarr.json"
+    content = json.loads(file.read_text())
+    place = content["chunk_grid"]["configuration"] if field == "chunk_shape" else content
+    place[field] = value
+    file.write_text(json.dumps(content))
+    with pytest.raises(JaxmapError, match=message):
+        load_map(path)
+
+
+def test_chunks_of_one_number_each_are_not_counted_for_ever(tmp_path) -> None:
+    path = tmp_path / "map.zarr"
+    save_map(path, small_map(), MapAttributes())
+    file = path / "log_odds" / "zarr.json"
+    content = json.loads(file.read_text())
+    content["shape"] = [3, 500, 400, 300]
+    content["chunk_grid"]["configuration"]["chunk_shape"] = [1, 1, 1, 1]
+    file.write_text(json.dumps(content))
+    edit_attributes(path, shape=[500, 400, 300])
+    with pytest.raises(JaxmapError, match="180,000,000 chunks"):
+        load_map(path)
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "log_odds/c/0/0/0/0"])
+@pytest.mark.parametrize("kind", ["pipe", "device", "loop"])
+def test_a_map_is_made_of_regular_files(tmp_path, name, kind) -> None:
+    path = tmp_path / "map.zarr"
+    save_map(path, small_map(), MapAttributes())
+    file = path / name
+    file.unlink()
+    if kind == "pipe":
+        os.mkfifo(file)
+    else:
+        file.symlink_to(file if kind == "loop" else "/dev/zero")
+    with pytest.raises(JaxmapError, match="cannot be read"):
+        load_map(path)
 
 
 def test_a_map_without_progress_is_complete(tmp_path) -> None:

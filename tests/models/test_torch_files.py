@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
+import collections
+import datetime
 import pickle
 import zipfile
 from pathlib import Path
@@ -9,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from torch_legacy import legacy_bytes
+from torch_zip import write_torch
 
 from jaxmap.errors import JaxmapError
 from jaxmap.models.torch_files import read_torch_file
@@ -55,7 +59,7 @@ def refusal(path: Path) -> str:
 
 @pytest.mark.parametrize("name", ["tiny.pth", "tiny_legacy.pth"])
 def test_what_torch_writes_is_read(name):
-    tensors = read_torch_file(GOLDEN / name)
+    tensors = {key.removeprefix("state_dict."): value for key, value in read_torch_file(GOLDEN / name).items()}
     base = np.arange(24, dtype=np.float32)
     assert set(tensors) == {"plain", "turned", "part", "half", "double", "parameter", "empty"}
     np.testing.assert_array_equal(tensors["plain"], base.reshape(2, 3, 4))
@@ -69,6 +73,23 @@ def test_what_torch_writes_is_read(name):
 def test_a_tensor_by_hand_is_read(tmp_path):
     path = write_zip(tmp_path / "a.pth", tensor_program((2, 3), (3, 1), 6), s0=np.arange(6, dtype="<f4").tobytes())
     np.testing.assert_array_equal(read_torch_file(path)["w"], np.arange(6.0).reshape(2, 3))
+
+
+def test_what_trainers_keep_beside_the_tensors_is_passed_over(tmp_path):
+    """Objects of known libraries are blanks: neither made nor looked at."""
+    beside = {
+        "path": Path("/runs"),
+        "counts": collections.Counter("aab"),
+        "factory": collections.defaultdict(list, a=[1]),
+        "options": argparse.Namespace(lr=0.1),
+        "when": datetime.datetime(2020, 1, 1),
+        "scalar": np.float64(0.5),
+        "array": np.arange(3),
+        "dtype": np.dtype("f4"),
+    }
+    programs = {name: pickle.dumps(value, protocol=2)[2:-1] for name, value in beside.items()}
+    path = write_torch(tmp_path / "a.ckpt", {"hyper_parameters": programs, "state_dict": {"w": np.ones(3, np.float32)}})
+    assert set(read_torch_file(path)) == {"state_dict.w"}
 
 
 class Bomb:

@@ -361,7 +361,7 @@ def test_an_empty_map_has_no_3d_view(run_folder) -> None:
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
-        (lambda run: (run / "metrics.json").unlink(), "no such file in .*metrics.json"),
+        (lambda run: (run / "metrics.json").unlink(), "there is no file .*metrics.json"),
         (lambda run: (run / "metrics.json").write_text("{"), "not readable as JSON"),
         (lambda run: (run / "metrics.json").write_text("[]"), "not a JSON object"),
         (lambda run: shutil.rmtree(run / "map.zarr"), "no such map"),

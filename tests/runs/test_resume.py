@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
-from killed import kill_when
+from killed import SLOW_DISK, kill_when
 from planned_runs import config_of, log_odds, metrics_of, planned
 from scenes import write_folder_sequence
 
@@ -36,14 +36,15 @@ def cut_after(index: int) -> Callable[[FusedFrame], None]:
     return on_frame
 
 
-def run_until(sequence: Path, out: Path, index: int, checkpoint_every_s: float = 0.0) -> None:
+def run_until(
+    sequence: Path, out: Path, index: int, checkpoint_every_s: float = 0.0, *, overwrite: bool = False
+) -> None:
     """Maps into `out`, saving after each frame, and is cut off after a frame, before that one is saved."""
-    folder = RunFolder(out)
-    folder.begin(planned(sequence).settings(config_of()), resume=False, overwrite=False)
-    with pytest.raises(Cut):
+    settings = planned(sequence).settings(config_of())
+    with pytest.raises(Cut), RunFolder(out).writing(settings, resume=False, overwrite=overwrite) as work:
         run_plan(
             planned(sequence),
-            folder,
+            work,
             strict=False,
             checkpoint_every_s=checkpoint_every_s,
             notify=lambda line: None,
@@ -77,6 +78,33 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, fini
     assert outcome.status == 0
     assert index == 0 or f"going on after {index} of {FRAMES} frames" in outcome.err
     same_run(tmp_path / "run", finished_run)
+
+
+@pytest.mark.slow
+def test_an_interrupt_right_after_a_frame_loses_no_picture(cli, scene_folder, finished_run, tmp_path):
+    run = tmp_path / "run"
+
+    def interrupt(fused: FusedFrame) -> None:
+        if fused.prepared.index == 2:
+            raise KeyboardInterrupt
+
+    folder = RunFolder(run)
+    folder.begin(planned(scene_folder).settings(config_of()), resume=False, overwrite=False)
+    with pytest.raises(KeyboardInterrupt):
+        run_plan(
+            planned(scene_folder),
+            folder,
+            strict=False,
+            checkpoint_every_s=60.0,
+            notify=lambda line: None,
+            on_frame=interrupt,
+        )
+    assert load_map(run / "map.zarr")[1].progress["next_index"] == 3
+    assert cli(*map_words(scene_folder, run, "--resume")).status == 0
+    pictures = [
+        {file.name: file.read_bytes() for file in (folder / "pictures").iterdir()} for folder in (run, finished_run)
+    ]
+    assert pictures[0] == pictures[1] and len(pictures[0]) >= 9
 
 
 @pytest.mark.slow
@@ -217,6 +245,54 @@ def test_overwriting_removes_what_an_earlier_run_has_written(cli, scene_folder, 
     assert {path.name for path in (run / "pictures").iterdir()} == {"000000_left.png", "000000_disparity.png"}
     assert len(old) > 2
     assert (run / "mine.txt").read_text() == "not the run's"
+
+
+@pytest.fixture
+def earlier_run(finished_run, tmp_path):
+    """A folder that holds a run already."""
+    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    (run / "map.ply").write_text("of the earlier run")
+    return run
+
+
+def test_a_run_that_fuses_nothing_leaves_the_one_it_was_to_replace(cli, scene_copy, earlier_run):
+    before = contents(earlier_run)
+    for image in (scene_copy / "right").iterdir():
+        image.rename(image.with_name(f"r_{image.name}"))
+    outcome = cli(*map_words(scene_copy, earlier_run, "--overwrite"))
+    assert outcome.status == 1
+    assert contents(earlier_run) == before and not (earlier_run / ".new").exists()
+
+
+@pytest.mark.slow
+def test_an_overwriting_run_that_was_cut_off_is_gone_on_with(cli, scene_folder, finished_run, earlier_run):
+    before = contents(earlier_run)
+    run_until(scene_folder, earlier_run, 3, overwrite=True)
+    assert {path: text for path, text in contents(earlier_run).items() if ".new" not in path.parts} == before
+    outcome = cli(*map_words(scene_folder, earlier_run, "--resume", "--stride", "2"))
+    assert outcome.status == 2 and "another stride" in outcome.error
+    outcome = cli(*map_words(scene_folder, earlier_run))
+    assert outcome.status == 1 and "holds a run already" in outcome.error
+    outcome = cli(*map_words(scene_folder, earlier_run, "--resume"))
+    assert outcome.status == 0 and "going on after 3" in outcome.err
+    same_run(earlier_run, finished_run)
+    assert not [path for path in earlier_run.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.slow
+def test_an_overwriting_run_that_is_killed_leaves_the_one_before_it(cli, scene_folder, finished_run, earlier_run):
+    before = contents(earlier_run)
+    words = map_words(scene_folder, earlier_run, "--overwrite", "--checkpoint-every-s", "0")
+    kill_when((earlier_run / ".new" / "map.zarr").exists, SLOW_DISK, words)
+    assert before.items() <= contents(earlier_run).items()
+    assert cli(*map_words(scene_folder, earlier_run, "--resume")).status == 0
+    same_run(earlier_run, finished_run)
+
+
+def test_a_run_that_was_whole_when_its_process_was_killed_is_put_in_place(cli, finished_run, earlier_run):
+    shutil.copytree(finished_run, earlier_run / ".whole")
+    assert cli("report", earlier_run).status == 0
+    same_run(earlier_run, finished_run)
 
 
 @pytest.mark.slow

@@ -13,8 +13,7 @@ import rasterio
 import yaml
 from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 
-from jaxmap.errors import JaxmapError
-from jaxmap.host.files import atomic_path, bundled, remove
+from jaxmap.host.files import atomic_path, bundled
 from jaxmap.mapping.store import load_map
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping import run_plan
@@ -139,17 +138,6 @@ def test_what_ends_a_job_is_told_like_ctrl_c(cli, scene_folder, tmp_path):
     assert cli(*map_words(scene_folder, tmp_path / "run", "--stop", "1", "--labeller", "none")).status == 0
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGTERM)
-
-
-def test_what_cannot_be_removed_is_told(tmp_path):
-    (tmp_path / "full").mkdir()
-    with pytest.raises(JaxmapError, match="writing failed|no permission to write") as caught:
-        remove(tmp_path / "full")
-    assert caught.value.where == str(tmp_path / "full") and caught.value.fix
-    (tmp_path / "file").touch()
-    for _ in range(2):
-        remove(tmp_path / "file")
-    assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
 
 @pytest.mark.parametrize("option", ["--calibration", "--model"])

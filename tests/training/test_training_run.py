@@ -117,9 +117,8 @@ def go(
     """Trains into `out`, as the command does; returns the lines for the user."""
     out.mkdir(exist_ok=True)
     lines: list[str] = []
-    folder = TrainingFolder(out)
-    folder.begin(plan, resume=resume, overwrite=overwrite)
-    TrainingRun(plan, folder, notify=lines.append, on_step=on_step).run()
+    with TrainingFolder(out).writing(plan, resume=resume, overwrite=overwrite) as work:
+        TrainingRun(plan, work, notify=lines.append, on_step=on_step).run()
     return lines
 
 
@@ -132,7 +131,7 @@ def refused(plan: TrainingPlan, out: Path, kind: type[JaxmapError] = JaxmapError
     return str(caught.value)
 
 
-def run_until(plan: TrainingPlan, out: Path, step: int, *, resume: bool = False) -> None:
+def run_until(plan: TrainingPlan, out: Path, step: int, **options: bool) -> None:
     """Trains until a step is done, and is cut off before an epoch that ends with it is saved."""
 
     def on_step(steps: int, note: str) -> None:
@@ -140,7 +139,7 @@ def run_until(plan: TrainingPlan, out: Path, step: int, *, resume: bool = False)
             raise Cut
 
     with pytest.raises(Cut):
-        go(plan, out, on_step, resume=resume)
+        go(plan, out, on_step, **options)
 
 
 # --- the whole run
@@ -348,7 +347,21 @@ def test_files_that_no_training_has_written_are_never_replaced(options, plan, tm
 
 def test_the_model_started_from_is_not_overwritten(plan, run_copy):
     changed = plan._replace(init=run_copy / "model.safetensors")
-    assert "an input would be overwritten" in refused(changed, run_copy, overwrite=True)
+    assert "an input would be overwritten" in refused(changed, run_copy, UsageError, overwrite=True)
+
+
+def test_a_run_that_is_replaced_stays_until_the_new_one_is_whole(plan, whole_run, run_copy):
+    (run_copy / "report.html").write_text("of the earlier run")
+    before = contents(run_copy)
+    run_until(plan, run_copy, 2, overwrite=True)
+    assert contents(run_copy) == before, "before the first checkpoint there is nothing to resume"
+    run_until(plan, run_copy, 5, overwrite=True)
+    assert before.items() <= contents(run_copy).items()
+    assert refused(plan._replace(config=replace(plan.config, seed=1)), run_copy, UsageError, resume=True)
+    lines = go(plan, run_copy, resume=True)
+    assert lines[0].startswith("resuming after epoch")
+    same_run(run_copy, whole_run)
+    assert not (run_copy / ".new").exists()
 
 
 # --- other data and other initial weights

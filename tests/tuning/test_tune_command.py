@@ -7,6 +7,7 @@ import json
 import re
 from html import escape
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
@@ -18,11 +19,13 @@ from tune_faults import tune_words, write_truth
 import jaxmap.host.output_folder
 import jaxmap.runs.tuning
 from jaxmap.errors import JaxmapError
+from jaxmap.fusion.params import make_fusion_params
 from jaxmap.host.output_folder import locked
 from jaxmap.mapping.store import load_map
-from jaxmap.runs.config import load_config
-from jaxmap.runs.tuning import descent_notes
+from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.tuning import descent_notes, tuned_config
 from jaxmap.tuning.descent import Losses, Step
+from jaxmap.tuning.parametrisation import TunedParams
 
 SHORT = ("--steps", "6", "--held-out-share", "0.4")
 
@@ -113,7 +116,7 @@ def test_what_is_assumed_of_the_ground_truth_is_told(cli, scene_folder, truth, t
     assert "truth.tif has no CRS" in outcome.err
 
 
-def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder, truth, tmp_path, monkeypatch):
+def test_a_run_that_breaks_leaves_the_files_of_an_earlier_one(cli, scene_folder, truth, tmp_path, monkeypatch):
     out = tmp_path / "fusion.yaml"
     for suffix in (".yaml", ".json", ".html"):
         out.with_suffix(suffix).write_text("of an earlier run")
@@ -123,9 +126,11 @@ def test_pages_of_an_earlier_run_do_not_lie_beside_new_numbers(cli, scene_folder
         raise JaxmapError("the loss diverges", where="tuning", fix="take a lower --learning-rate")
 
     monkeypatch.setattr(jaxmap.runs.tuning, "descend", breaking)
-    assert cli(*tune_words(scene_folder, truth, out, *SHORT, "--overwrite")).status == 1
-    assert load_config(str(out)).fusion.class_increments is not None
-    assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
+    outcome = cli(*tune_words(scene_folder, truth, out, *SHORT, "--overwrite"))
+    best = tmp_path / ".fusion.new" / "fusion.yaml"
+    assert outcome.status == 1 and f"the best so far is in {best.parent}" in outcome.err
+    assert load_config(str(best)).fusion.class_increments is not None
+    assert all(out.with_suffix(suffix).read_text() == "of an earlier run" for suffix in (".yaml", ".json", ".html"))
 
 
 @pytest.mark.slow
@@ -234,3 +239,14 @@ def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, tr
     assert len(told["traverses"]) == 2
     assert told["before"]["softness_m"] == 0.0 and told["stages"][0]["parameters"]["softness_m"] > 0
     assert {"sigma_m", "threshold_m"} <= told["before"].keys()
+
+
+@pytest.mark.parametrize("labeller, own", [("deeplab", {"temperature": 2.0}), ("files", {}), ("relief", {})])
+def test_tuned_numbers_go_to_the_options_they_are_of(labeller, own):
+    """Relief beside another labeller has numbers of its own, and so may the other have."""
+    fusion = make_fusion_params(("sand", "rock"))
+    numbers = {name: jnp.float32(value) for name, value in {**own, "bias": -1.5, "softness_m": 0.04}.items()}
+    config = tuned_config(MapConfig(labeller=labeller), TunedParams(fusion, numbers))
+    assert (config.relief.bias, config.relief.softness_m) == (-1.5, 0.04)
+    assert config.deeplab.temperature == own.get("temperature", 1.0)
+    assert config.plane == MapConfig().plane
