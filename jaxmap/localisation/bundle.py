@@ -28,6 +28,9 @@ CONVERGED = 1e-3
 SETTLED = 1e-5
 """The pose of one camera is found when a step is smaller, in metres and radians."""
 
+UNSHARED = 250_000
+"""Multiplications in a product of matrices that OpenBLAS leaves to one thread."""
+
 
 class Sightings(NamedTuple):
     """Which camera saw which point where.
@@ -200,12 +203,12 @@ def _stepped(
     own[:, diagonal, diagonal] = own[:, diagonal, diagonal] * (1 + damping) + 1e-9
     inverse = np.linalg.inv(own)
     cross = cross.reshape(points, cameras * 6, 3)
-    pulled = (cross @ inverse).transpose(1, 0, 2).reshape(cameras * 6, -1)
-    normal = -pulled @ cross.transpose(0, 2, 1).reshape(-1, cameras * 6)
+    pulled = cross @ inverse
+    normal = -_sum_of_products(pulled, cross)
     for index in range(cameras):
         block = slice(6 * index, 6 * index + 6)
         normal[block, block] += poses[index]
-    right = down_poses.ravel() - pulled @ down_points.ravel()
+    right = down_poses.ravel() - np.einsum("pij,pj->i", pulled, down_points)
 
     free = np.repeat(~fixed, 6)
     reduced = normal[np.ix_(free, free)]
@@ -215,6 +218,23 @@ def _stepped(
     step[free] = np.linalg.solve(reduced, right[free])
     point_step = np.einsum("pij,pj->pi", inverse, down_points - np.einsum("pij,i->pj", cross, step))
     return Bundle(_moved(bundle.T_world_camera, step.reshape(-1, 6)), bundle.points_world + point_step)
+
+
+def _sum_of_products(
+    one: Float64[np.ndarray, "P n 3"], other: Float64[np.ndarray, "P n 3"]
+) -> Float64[np.ndarray, "n n"]:
+    """The sum over the points of `one @ other.T`.
+
+    In chunks that BLAS does not share among threads: waiting for each other, they take longer than one alone.
+    """
+    points, size, _ = one.shape
+    chunk = max(1, UNSHARED // (3 * size**2))
+    padding = ((0, -points % chunk), (0, 0), (0, 0))
+    wide = [
+        np.pad(part, padding).reshape(-1, chunk, size, 3).transpose(0, 2, 1, 3).reshape(-1, size, 3 * chunk)
+        for part in (one, other)
+    ]
+    return (wide[0] @ wide[1].transpose(0, 2, 1)).sum(axis=0)
 
 
 def _moved(T: Float64[np.ndarray, "K 4 4"], step: Float64[np.ndarray, "K 6"]) -> Float64[np.ndarray, "K 4 4"]:
