@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from jaxmap.datasets.images import read_index_image
+from jaxmap.datasets.masks import read_values
 from jaxmap.models.checkpoint import load_network, save_model
 
 BUNDLED = Path(__file__).resolve().parents[1] / "jaxmap" / "bundled"
@@ -93,7 +93,7 @@ def joined(folder: Path, sets: list[Path], mars_rocks: Path | None) -> Path:
             (train if index % VALIDATE_EVERY else validation).append(path.stem)
     for name in [] if mars_rocks is None else (mars_rocks / "train.txt").read_text().split():
         image = next((mars_rocks / "images").glob(f"{Path(name).stem}.*"))
-        mask = read_index_image(mars_rocks / "masks" / f"{image.stem}.png")
+        mask = read_values(mars_rocks / "masks" / f"{image.stem}.png")
         coded = Image.fromarray(np.where(mask > 127, ROCK, NOT_ROCK).astype(np.uint8))
         for copy in range(len(sets)):
             link(folder / "images" / f"mars{copy}_{image.name}", image)

@@ -142,7 +142,7 @@ def strange_label(folder: Path) -> None:
 
 
 def colour_label(folder: Path) -> None:
-    Image.fromarray(np.zeros((120, 160, 3), np.uint8)).save(folder / "f000.png")
+    Image.new("RGB", (160, 120), "red").save(folder / "f000.png")
 
 
 def wild_probabilities(folder: Path) -> None:

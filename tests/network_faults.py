@@ -187,7 +187,7 @@ SEGMENT_FAULTS: dict[str, tuple[int, Spoil]] = {
     "no folder of masks": (1, words("--masks", "{}/nowhere")),
     "mask of another size": (1, mask(np.zeros((SIZE[0], SIZE[1] - 1), np.uint8))),
     "mask label out of range": (1, mask(np.full(SIZE, 3, np.uint8))),
-    "mask in colours": (1, mask(np.zeros((*SIZE, 3), np.uint8))),
+    "mask in colours": (1, mask(np.full((*SIZE, 3), (9, 0, 0), np.uint8))),
     "mask that is no image": (1, garbage("masks/b.png")),
     "image that is no image": (1, garbage("images/a.png")),
     "size of zero": (2, words("--size", "0", "64")),

@@ -31,7 +31,7 @@ class MapArguments:
     """
 
     sequence: tyro.conf.Positional[str]
-    """Folder of one sequence, or sample:motorcycle."""
+    """Folder of one sequence, a ROS bag, or sample:motorcycle."""
     out: Path
     """The run folder to write; not the sequence's own folder."""
     config: str | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +13,15 @@ import tyro
 from annotated_types import Interval, MinLen
 
 from jaxmap.commands.console import Console, check_bounds, parse
+from jaxmap.datasets.options import (
+    BagOptions,
+    LengthUnit,
+    PoseConvention,
+    PosesAre,
+    PosesWorld,
+    QuaternionOrder,
+    TimeUnit,
+)
 from jaxmap.host.settings import Place, count
 
 Adjustable = Literal["poses", "mounting", "baseline", "offset"]
@@ -61,13 +70,28 @@ class RefineArguments:
     max_depth_m: Positive | None = None
     """Farther points are not used; by default those whose depth noise exceeds 0.35 m."""
     dataset: str = "auto"
-    """The reader: auto, kitti, euroc, folder or katwijk."""
+    """The reader, see jaxmap map --help."""
     poses: Path | None = None
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
+    poses_world: PosesWorld = "auto"
+    """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
+    pose_convention: PoseConvention = "auto"
+    """Axes that the poses describe, see jaxmap map --help."""
+    poses_are: PosesAre = "T_world_camera"
+    """What takes points into what: the poses of the camera in the world, or the inverse."""
+    quaternion: QuaternionOrder = "auto"
+    """Order of a quaternion in the pose file."""
+    poses_time_unit: TimeUnit = "auto"
+    """Unit of the times in the pose file."""
+    poses_unit: LengthUnit = "m"
+    """Unit of the positions in the pose file."""
+    baseline_unit: LengthUnit = "m"
+    """Unit in which the calibration gives the stereo baseline."""
     calibration: Path | None = None
     """Camera file in place of the sequence's own."""
     camera: str | None = None
     """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
+    bag: BagOptions = field(default_factory=BagOptions)
     crs: str | None = None
     """Coordinate reference system of the poses, such as EPSG:32631."""
     remap: tuple[str, ...] = ()
@@ -106,8 +130,16 @@ def main(words: Sequence[str]) -> int:
     options = ReadOptions(
         dataset=arguments.dataset,
         poses=arguments.poses,
+        poses_world=arguments.poses_world,
+        pose_convention=arguments.pose_convention,
+        poses_are=arguments.poses_are,
+        quaternion=arguments.quaternion,
+        poses_time_unit=arguments.poses_time_unit,
+        poses_unit=arguments.poses_unit,
+        baseline_unit=arguments.baseline_unit,
         calibration=arguments.calibration,
         camera=arguments.camera,
+        bag=arguments.bag,
         crs=arguments.crs,
         max_pose_gap_s=arguments.max_pose_gap_s,
         start=arguments.start,

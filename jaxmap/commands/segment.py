@@ -20,9 +20,10 @@ Edge = Annotated[int, count(8192)]
 class SegmentArguments:
     """Label images with a network.
 
-    Writes NAME.png (class indices) and NAME_overlay.png for each image, at its own size and on its pixels
-    as they are stored: the rotation tag of a photograph is not applied. Inputs are never replaced. An image
-    that cannot be read is skipped and reported at the end; the exit status is then 1.
+    Writes NAME.png (class indices) and NAME_overlay.png for each image, at its own size and as viewers show it: the
+    rotation tag of a photograph is applied. With --size, pictures of more than 34 million pixels are decimated while
+    they are read, and their overlays are smaller. Inputs are never replaced. An image that cannot be read is skipped
+    and reported at the end; the exit status is then 1.
     """
 
     images: tyro.conf.Positional[tuple[Path, ...]]
@@ -35,6 +36,10 @@ class SegmentArguments:
     """Height and width that the network runs at; each image's own without it."""
     masks: Path | None = None
     """Folder of true labels, NAME.png of class indices (255: none), to score against."""
+    remap: dict[str, str] | None = None
+    """Class by value of the masks, such as 0 "not rock" 255 rock; "ignore" is no class, and the value * every other."""
+    palette: dict[str, str] | None = None
+    """Colour of the masks by class, such as rock #ff0000; several of a class with blanks between."""
     scores: Path | None = None
     """JSON file to write the scores to; needs --masks."""
     save_logits: bool = False
@@ -50,12 +55,24 @@ def main(words: Sequence[str]) -> int:
     check_bounds(arguments, "segment")
     if not arguments.images:
         raise UsageError("no images", where="the command line", fix="name image files or folders")
+    if arguments.masks is None and (arguments.remap or arguments.palette):
+        raise UsageError("no masks are given to read", where="--remap", fix="give --masks DIR")
     if arguments.scores is not None and arguments.masks is None:
         raise UsageError("there is nothing to score against", where="--scores", fix="give --masks DIR")
 
+    from jaxmap.datasets.images import rotation_notes
+    from jaxmap.datasets.masks import make_mask_lookup
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.models.checkpoint import load_network
-    from jaxmap.runs.segmentation import Segmenter, check_masks, check_outputs, find_images, find_masks, label_images
+    from jaxmap.runs.segmentation import (
+        LabelWriter,
+        Segmenter,
+        check_masks,
+        check_outputs,
+        find_images,
+        find_masks,
+        label_images,
+    )
 
     keep_compiled_programs()
     images = find_images(arguments.images)
@@ -64,13 +81,13 @@ def main(words: Sequence[str]) -> int:
     inputs = [*images, *masks, arguments.model]
     check_outputs(images, arguments.out, inputs=inputs, scores=arguments.scores)
     segmenter = Segmenter(model, arguments.size)
-    if masks:
-        check_masks(images, masks, len(segmenter.classes))
+    lookup = make_mask_lookup(segmenter.classes, arguments.remap, arguments.palette, option="--", all_classes=False)
     console = Console()
+    for note in [*rotation_notes(images), *(check_masks(images, masks, lookup) if masks else [])]:
+        console.notify(f"note: {note}")
+    writer = LabelWriter(segmenter, arguments.out, lookup, arguments.save_logits)
     with console.steps("labelling", "images", len(images)) as advance:
-        scores, faults = label_images(
-            segmenter, images, arguments.out, masks=masks, save_logits=arguments.save_logits, advance=advance
-        )
+        scores, faults = label_images(writer, images, masks, advance=advance)
     if masks:
         _print_scores(console, scores.summary(), arguments.scores)
     if len(faults) < len(images):

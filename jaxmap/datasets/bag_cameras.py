@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from jaxmap.datasets.projections import camera_of_projections
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
-from jaxmap.types import StereoCamera, make_stereo_camera
+from jaxmap.types import StereoCamera
 
 _COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "": (0,)}
 
@@ -62,33 +63,16 @@ def rectified_camera(
         JaxmapError: no focal length, two different ones, or no baseline.
     """
     where = f"{left.topic} and {right.topic}"
-    for info in (left, right):
-        if not (np.isfinite(info.P).all() and info.P[0, 0] > 0 and info.P[1, 1] > 0):
-            raise JaxmapError("P holds no focal length", where=info.topic, fix="give --calibration FILE")
-    if not np.allclose(left.P[[0, 1, 1], [0, 1, 2]], right.P[[0, 1, 1], [0, 1, 2]], rtol=1e-3):
-        raise JaxmapError(
-            "P of the two cameras differ in focal length or row", where=where, fix="give --calibration FILE"
-        )
-    baseline_m = (left.P[0, 3] - right.P[0, 3]) / left.P[0, 0]
-    if baseline_m == 0 and T_left_right is not None:
+    baseline_m = None
+    if left.P[0, 3] == right.P[0, 3]:
+        if T_left_right is None:
+            raise JaxmapError(
+                "no baseline: P[0, 3] is the same in both, and tf does not connect the cameras",
+                where=where,
+                fix="give --calibration FILE",
+            )
         baseline_m = float(np.linalg.norm(T_left_right[:3, 3]))
-    if baseline_m == 0:
-        raise JaxmapError(
-            "no baseline: P[0, 3] is 0 in both, and tf does not connect the cameras",
-            where=where,
-            fix="give --calibration FILE",
-        )
-    return make_stereo_camera(
-        fx_px=left.P[0, 0],
-        fy_px=left.P[1, 1],
-        cx_px=left.P[0, 2],
-        cy_px=left.P[1, 2],
-        baseline_m=baseline_m,
-        doffs_px=right.P[0, 2] - left.P[0, 2],
-        width_px=left.size_px[0],
-        height_px=left.size_px[1],
-        where=f"{where} (left and right swapped?)",
-    )
+    return camera_of_projections(left.P, right.P, left.size_px, f"{where} (left and right swapped?)", baseline_m)
 
 
 def raw_rig(left: CameraInfo, right: CameraInfo, T_left_right: Float64[np.ndarray, "4 4"] | None) -> StereoRig:

@@ -156,8 +156,7 @@ def _told(where: Path) -> Iterator[None]:
     except Exception as fault:
         # On damaged files the readers raise nearly anything; some of it without a text.
         reason = str(fault) or type(fault).__name__
-        raise JaxmapError(
-            f"the bag cannot be read ({reason[:160]})",
-            where=where,
-            fix="restore the file, or mend it by rosbag reindex (ROS 1), ros2 bag reindex or mcap recover",
-        ) from fault
+        fix = "restore the file, or mend it by rosbag reindex (ROS 1), ros2 bag reindex or mcap recover"
+        if "Profile" in reason:
+            fix = "of MCAP files those of ROS 2 are read; give the bag that this one was made of"
+        raise JaxmapError(f"the bag cannot be read ({reason[:160]})", where=where, fix=fix) from fault

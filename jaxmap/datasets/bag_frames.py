@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.spatial.transform import Rotation
 
-from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at
+from jaxmap.datasets.poses import PoseTrack, poses_at
+from jaxmap.datasets.stamped_poses import StampedPose, make_track
 from jaxmap.errors import JaxmapError
 
 T_LINK_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """A camera's optical frame (x right, y down, z forward) in its link frame (x forward, y left, z up), REP 103."""
 
+LEAST_TRAVEL_M = 0.2
+"""What moves less does not tell its axes by its motion."""
+
 _GLOBES = ("earth", "ecef")
 """Frames above a local world, in which z is not up (REP 105)."""
-
-
-class StampedPose(NamedTuple):
-    """A pose at a time; a quaternion of length 0 stands in messages that were never filled."""
-
-    time_ns: int
-    position_m: tuple[float, float, float]
-    quaternion_xyzw: tuple[float, float, float, float]
 
 
 def frame_name(name: str) -> str:
@@ -39,31 +33,6 @@ def stamped_pose(time_ns: int, pose: Any) -> StampedPose:
     at = pose.position if hasattr(pose, "position") else pose.translation
     turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
     return StampedPose(time_ns, (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
-
-
-def make_track(poses: Iterable[StampedPose], where: str) -> tuple[PoseTrack, int]:
-    """A track in the order of time, and how many poses were left out: repeated times, and poses that are none.
-
-    Raises:
-        JaxmapError: nothing is left.
-    """
-    by_time: dict[int, StampedPose] = {}
-    count = 0
-    for pose in poses:
-        count += 1
-        norm = float(np.linalg.norm(pose.quaternion_xyzw))
-        if abs(norm - 1) < 1e-2 and np.isfinite(pose.position_m).all():
-            by_time.setdefault(pose.time_ns, pose)
-    if not by_time:
-        raise JaxmapError(f"none of {count} poses is whole", where=where, fix="choose another with --bag.poses TOPIC")
-    kept = [by_time[time_ns] for time_ns in sorted(by_time)]
-    T = np.tile(np.eye(4), (len(kept), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat([pose.quaternion_xyzw for pose in kept]).as_matrix()
-    T[:, :3, 3] = [pose.position_m for pose in kept]
-    times_s = np.array([pose.time_ns / 1e9 for pose in kept])
-    # Far from 1970 float64 resolves no less than a quarter of a microsecond.
-    distinct = np.diff(times_s, prepend=-np.inf) > 0
-    return make_pose_track(times_s[distinct], T[distinct], where=where), count - int(distinct.sum())
 
 
 class FrameTree:
@@ -180,7 +149,7 @@ def axes_of(T_world_child: Float64[np.ndarray, "N 4 4"]) -> Literal["optical", "
         return "optical"
     steps = np.diff(T_world_child[:, :3, 3], axis=0)
     along = np.abs(np.einsum("nij,ni->nj", T_world_child[:-1, :3, :3], steps)).sum(axis=0)
-    return "optical" if along[2] > along[0] else "body"
+    return "optical" if along[2] > max(2 * along[0], LEAST_TRAVEL_M) else "body"
 
 
 def link_to_optical(frame: str, R_body_camera: Float64[np.ndarray, "3 3"] | None) -> bool:

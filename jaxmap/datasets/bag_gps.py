@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from jaxmap.datasets.bag_frames import FrameTree, make_track
+from jaxmap.datasets.bag_frames import FrameTree
 from jaxmap.datasets.bag_log import BagLog, Fix
 from jaxmap.datasets.bag_poses import BagPoses, placed
 from jaxmap.datasets.crs import to_utm, utm_crs
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import make_pose_track, poses_at
+from jaxmap.datasets.stamped_poses import make_track
 from jaxmap.errors import JaxmapError
 
 MIN_TRAVEL_M = 3.0

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 from jaxmap.datasets.bag_cameras import CameraInfo
 from jaxmap.datasets.bag_files import Bag, Message, Place
-from jaxmap.datasets.bag_frames import FrameTree, StampedPose, frame_name, stamped_pose
+from jaxmap.datasets.bag_frames import FrameTree, frame_name, stamped_pose
 from jaxmap.datasets.bag_topics import FIX_TYPE, IMAGE_TYPES, IMU_TYPE, INFO_TYPE, TF_TYPES
+from jaxmap.datasets.stamped_poses import StampedPose
 
 
 class Shot(NamedTuple):

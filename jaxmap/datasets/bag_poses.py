@@ -12,11 +12,12 @@ from jaxmap.datasets.bag_frames import (
     FrameTree,
     axes_of,
     link_to_optical,
-    make_track,
 )
 from jaxmap.datasets.bag_log import BagLog
+from jaxmap.datasets.base import by_conventions
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import PoseTrack, make_pose_track, poses_at
+from jaxmap.datasets.stamped_poses import make_track
 from jaxmap.errors import JaxmapError
 
 
@@ -71,7 +72,10 @@ def tf_poses(
             fix=f"check the clocks, or raise --max-pose-gap-s {options.max_pose_gap_s:g}",
         )
     track = make_pose_track(times_s[known], T[known], where=f"tf from {camera_frame} to {world}")
-    return BagPoses(track, T_frame_optical, camera_frame, [f"poses of {camera_frame} in {world} from tf"])
+    notes = [f"poses of {camera_frame} in {world} from tf"]
+    if options.pose_convention != "auto":
+        return BagPoses(by_conventions(track, options), np.eye(4), camera_frame, notes)
+    return BagPoses(by_conventions(track, options), T_frame_optical, camera_frame, notes)
 
 
 def topic_poses(
@@ -90,6 +94,11 @@ def topic_poses(
     track, dropped = make_track(log.poses[topic], topic)
     notes = [f"poses from {topic}"]
     notes += [f"{dropped} of {len(track.T) + dropped} poses of {topic} repeat a time or are not whole"] * bool(dropped)
+    track = by_conventions(track, options)
+    if options.pose_convention != "auto":
+        return BagPoses(
+            track, np.eye(4), "", [*notes, f"{options.pose_convention} axes at the camera's place, as asked"]
+        )
     poses = placed(log, track, log.children[topic], camera_frame, T_frame_optical, times_s, options)
     return poses._replace(notes=[*notes, *poses.notes])
 

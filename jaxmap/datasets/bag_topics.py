@@ -49,11 +49,9 @@ def choose_pair(topics: Mapping[str, Topic], options: BagOptions, where: Path) -
         UsageError: a topic of the options is not an image topic of the bag.
     """
     images = {name: topic for name, topic in topics.items() if topic.type in IMAGE_TYPES}
-    for option, name in (("left", options.left), ("right", options.right)):
+    for option, name in (("--bag.left", options.left), ("--bag.right", options.right)):
         if name is not None and name not in images:
-            raise UsageError(
-                f"{name} is no image topic of the bag: {_listed(images)}", where=f"--bag.{option}", fix="choose one"
-            )
+            raise UsageError(f"{name} is no image topic of the bag: {_listed(images)}", where=option, fix="choose one")
     if options.left is not None and options.right is not None:
         if options.left == options.right:
             raise UsageError("--bag.left and --bag.right are one topic", fix="give the two topics of a stereo pair")
@@ -150,8 +148,7 @@ def choose_poses(topics: Mapping[str, Topic], options: BagOptions, where: Path) 
         raise JaxmapError(
             f"the bag has no poses: no Odometry, pose, Path, tf or NavSatFix topic among {_listed(topics)}",
             where=where,
-            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera), "
-            "or estimate them from the images: --poses odometry",
+            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera), or --poses odometry",
         )
     return chosen[0]
 

@@ -8,26 +8,37 @@ them to `assemble`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
+from jaxmap.datasets.bit_depth import bits_note
 from jaxmap.datasets.calibration import read_mounting
-from jaxmap.datasets.images import ImageArray, first_image_size_px, read_image_pair
-from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.images import (
+    ImageArray,
+    first_image_size_px,
+    image_rotation_tag,
+    read_image_pair,
+    sequence_bits,
+)
+from jaxmap.datasets.options import Bits, ReadOptions
+from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE, PoseReading, stand_upright, to_z_up
 from jaxmap.datasets.poses import (
     PoseTrack,
     make_pose_track,
     poses_at,
     read_poses,
     split_site_origin,
-    to_z_up,
     with_timestamps,
+    without_wild_poses,
 )
-from jaxmap.errors import JaxmapError
+from jaxmap.datasets.units import METRES, UNIT_NAMES, unit_that_overlaps, with_baseline_unit
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
 
@@ -71,7 +82,13 @@ class StereoSequence:
         site_origin: float64 (3,), what was subtracted from the positions.
         crs: the coordinate reference system of `site_origin`, e.g. "EPSG:32631", or None.
         notes: what the reader reports to the user (frames left out, conventions assumed).
+        pose_faults: those of the notes that tell of poses that were left out as unusable.
+        pose_reading: the conventions that the poses were read by.
         read_pair: reads the images of one frame.
+        rectify_labels: where `read_pair` rectifies: the same for labels (H, W) or probabilities (H, W, C) of the left
+            image of a frame as it lies on disk; else None.
+        true_disparity: reads the true disparity of a frame's left image in px, NaN where unknown; None where the
+            sequence has no truth, and for a frame without one.
     """
 
     name: str
@@ -84,6 +101,10 @@ class StereoSequence:
     site_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    rectify_labels: Callable[[FrameRef, np.ndarray], np.ndarray] | None = None
+    true_disparity: Callable[[FrameRef], np.ndarray | None] | None = None
+    pose_faults: tuple[str, ...] = ()
+    pose_reading: PoseReading = field(default_factory=PoseReading)
 
 
 @dataclass(frozen=True)
@@ -105,13 +126,16 @@ class Reader:
     cameras: tuple[str, ...] = ()
 
 
-def read_stereo_pair(frame: FrameRef) -> StereoPair:
+def read_stereo_pair(
+    frame: FrameRef, *, bits: Bits | None = None, size_px: tuple[int, int] | None = None
+) -> StereoPair:
     """Reads the images of one frame, see `images.read_image_pair`.
 
     Raises:
-        FrameError: an image cannot be read, or the two differ in size.
+        FrameError: an image cannot be read, or has another size than asked for or than the other one.
     """
-    return StereoPair(*read_image_pair(frame.left, frame.right, where=f"frame {frame.name} ({frame.right})"))
+    where = f"frame {frame.name} ({frame.right})"
+    return StereoPair(*read_image_pair(frame.left, frame.right, where, bits=bits, size_px=size_px))
 
 
 UNPOSED = make_pose_track(np.zeros(1), np.eye(4)[None], where="--poses odometry")
@@ -125,10 +149,12 @@ def from_images(options: ReadOptions) -> bool:
 
 
 def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False) -> PoseTrack:
-    """The poses given by the options, else those of the sequence; `UNPOSED` where the images are to give them.
+    """The poses given by the options, else those of the sequence, in metres and of the left camera's optical axes.
+
+    `UNPOSED` where the images are to give them.
 
     Args:
-        options: `poses` has precedence.
+        options: `poses` has precedence; the conventions of the file.
         own: the sequence's own pose file, which need not exist.
         allow_body: whether the reader can use poses of the body (EuRoC csv).
 
@@ -144,14 +170,39 @@ def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False
             fix="give them with --poses FILE (TUM text, T_world_camera of the left camera), "
             "or estimate them from the images: --poses odometry",
         )
-    track = read_poses(path)
-    if track.child == "body" and not allow_body:
-        raise JaxmapError(
-            "EuRoC csv holds poses of the body, not of the camera",
-            where=path,
-            fix="give T_world_camera of the left camera as TUM text",
+    track = read_poses(path, options.quaternion, options.poses_time_unit)
+    notes = [*track.notes]
+    track = by_conventions(track, options)
+    child = "camera" if options.pose_convention != "auto" else track.child
+    if child == "body" and not allow_body:
+        if not stand_upright(track.T[track.usable]):
+            raise JaxmapError(
+                "a csv of EuRoC's form holds poses of the body, not of the camera",
+                where=path,
+                fix="name their axes with --pose-convention: optical if they are of the left camera, body (x forward, "
+                "y left, z up) if their frame sits at the camera; else give T_world_camera as TUM text",
+            )
+        child = "camera"
+        notes.append(
+            f"the poses in {path.name} stand upright as those of a camera's optical axes, and are taken for them"
         )
-    return track
+    return replace(track, child=child, notes=tuple(notes))
+
+
+def by_conventions(track: PoseTrack, options: ReadOptions) -> PoseTrack:
+    """A track as it was recorded, read by the options: poses of optical axes, and positions in metres."""
+    T = reading_of(options, track).camera_poses(track.T)
+    T[:, :3, 3] *= METRES[options.poses_unit]
+    return replace(track, T=T)
+
+
+def reading_of(options: ReadOptions, track: PoseTrack) -> PoseReading:
+    """The conventions that poses are read by; the world is z up until it is found out."""
+    return PoseReading(
+        pose_convention="optical" if options.pose_convention == "auto" else options.pose_convention,
+        poses_are=options.poses_are,
+        quaternion=track.quaternion,
+    )
 
 
 def assemble(
@@ -166,8 +217,9 @@ def assemble(
     T_child_camera: Float64[np.ndarray, "*frames 4 4"] | None = None,
     crs: str | None = None,
     notes: Sequence[str] = (),
-    read_pair: Callable[[FrameRef], StereoPair] = read_stereo_pair,
+    read_pair: Callable[[FrameRef], StereoPair] | None = None,
     size_px: tuple[int, int] | None = None,
+    true_disparity: Callable[[FrameRef], np.ndarray | None] | None = None,
 ) -> StereoSequence:
     """Joins frames, poses and calibration into a sequence in a z-up world.
 
@@ -186,8 +238,9 @@ def assemble(
             where the child frame is the left camera.
         crs: the coordinate reference system of the poses.
         notes: what the reader reports to the user.
-        read_pair: reads the images of one frame.
+        read_pair: reads the images of one frame; by default from its files, with one depth of bits for all frames.
         size_px: width and height of the images; by default those of the first image file.
+        true_disparity: reads the truth of one frame, where there is any.
 
     Raises:
         JaxmapError: frames out of order, counts that disagree, an image of another size than the
@@ -195,8 +248,10 @@ def assemble(
     """
     timestamps_s = np.array([frame.timestamp_s for frame in frames], np.float64)
     _check_frames(frames, timestamps_s, camera, where, size_px)
+    unposed = track is UNPOSED
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
+    track = without_wild_poses(track)
     assert track.timestamps_s is not None
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
 
@@ -207,29 +262,32 @@ def assemble(
             where=where,
             fix="choose another range",
         )
-    if track is UNPOSED:
+    if unposed:
         # All of them: a stride comes after the odometry, which needs every frame.
-        seen = tuple(frames[options.start : options.stop])
+        seen, all_notes = tuple(frames[options.start : options.stop]), list(notes)
         return StereoSequence(
-            name, dataset, camera, seen, np.tile(np.eye(4), (len(seen), 1, 1)), read_pair, notes=tuple(notes)
+            name=name,
+            dataset=dataset,
+            camera=with_baseline_unit(camera, options.baseline_unit),
+            frames=seen,
+            T_world_camera=np.tile(np.eye(4), (len(seen), 1, 1)),
+            read_pair=read_pair or _pair_reader(frames, camera, options, all_notes),
+            notes=tuple(all_notes),
+            true_disparity=true_disparity,
         )
     kept = selected[has_pose[selected]]
     if not len(kept):
-        raise JaxmapError(
-            f"none of {len(selected)} frames has a pose: the frames span {_span(timestamps_s[selected])}, "
-            f"the poses {_span(track.timestamps_s)}",
-            where=track.where,
-            fix=f"check that both use one clock, or that poses lie within max_pose_gap_s {options.max_pose_gap_s:g} s",
-        )
+        raise _no_pose(timestamps_s[selected], track, options)
     T_source_camera = T_source_child[has_pose]
     if T_child_camera is not None:
         T_source_camera = T_source_camera @ (T_child_camera if T_child_camera.ndim == 2 else T_child_camera[has_pose])
-    if options.poses is None and options.calibration is not None and options.calibration.suffix.lower() != ".mat":
+    mounted = options.poses is None or options.pose_convention in ("body", "frd")
+    if mounted and options.calibration is not None and options.calibration.suffix.lower() != ".mat":
         T_source_camera = T_source_camera @ read_mounting(options.calibration)
     T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
 
-    all_notes = list(notes)
+    all_notes = [*notes, *track.notes, *track.faults]
     if options.poses_world == "auto" and not np.array_equal(T_world_source, np.eye(4)):
         all_notes.append("the poses' world is taken for camera-like (y down) and turned z-up")
     if len(kept) < len(selected):
@@ -237,11 +295,12 @@ def assemble(
             f"{len(selected) - len(kept)} of {len(selected)} frames have no pose and are left out: "
             f"the frames span {_span(timestamps_s[selected])}, the poses {_span(track.timestamps_s)}"
         )
+    read_pair = read_pair or _pair_reader(frames, camera, options, all_notes)
     row_of_frame = np.cumsum(has_pose) - 1
     return StereoSequence(
         name=name,
         dataset=dataset,
-        camera=camera,
+        camera=with_baseline_unit(camera, options.baseline_unit),
         frames=tuple(frames[index] for index in kept),
         T_world_camera=T_world_camera[row_of_frame[kept]],
         read_pair=read_pair,
@@ -249,6 +308,11 @@ def assemble(
         site_origin=site_origin,
         crs=options.crs or crs,
         notes=tuple(all_notes),
+        true_disparity=true_disparity,
+        pose_faults=track.faults,
+        pose_reading=reading_of(options, track)._replace(
+            poses_world=next(name for name, T in T_Z_UP_SOURCE.items() if np.array_equal(T, T_world_source))
+        ),
     )
 
 
@@ -275,6 +339,44 @@ def _check_frames(
             where=where,
             fix="give the calibration of these images",
         )
+
+
+def _pair_reader(
+    frames: Sequence[FrameRef], camera: StereoCamera | StereoRig, options: ReadOptions, notes: list[str]
+) -> Callable[[FrameRef], StereoPair]:
+    """Reads frames from their files, with one depth of bits for all; what was taken is noted."""
+    bits = _bits(frames, options, notes)
+    return partial(read_stereo_pair, bits=bits, size_px=(camera.width_px, camera.height_px))
+
+
+def _bits(frames: Sequence[FrameRef], options: ReadOptions, notes: list[str]) -> Bits | None:
+    """How many bits 16-bit images use, as given or found; what was taken is noted, and a rotation tag, too."""
+    with suppress(FrameError):
+        if (tag := image_rotation_tag(frames[0].left)) != 1:
+            notes.append(
+                f"the images carry the rotation tag {tag}, which is not applied: calibration, labels and masks must "
+                "refer to the pixels as they are stored"
+            )
+    found = sequence_bits([(frame.left, frame.right) for frame in frames])
+    if found is None:
+        return options.image_bits
+    if options.image_bits is None:
+        notes.append(bits_note(*found))
+    return options.image_bits or found.bits
+
+
+def _no_pose(timestamps_s: np.ndarray, track: PoseTrack, options: ReadOptions) -> JaxmapError:
+    """No frame has a pose: says so, and which unit of the poses' times would make clocks meet."""
+    assert track.timestamps_s is not None
+    fix = f"check that both use one clock, or that poses lie within max_pose_gap_s {options.max_pose_gap_s:g} s"
+    if unit := unit_that_overlaps(track.timestamps_s, timestamps_s, track.time_unit):
+        fix = f"they would meet if the poses' times were in {UNIT_NAMES[unit]}: --poses-time-unit {unit}"
+    return JaxmapError(
+        f"none of {len(timestamps_s)} frames has a pose: the frames span {_span(timestamps_s)}, "
+        f"the poses {_span(track.timestamps_s)}",
+        where=track.where,
+        fix=fix,
+    )
 
 
 def _span(timestamps_s: np.ndarray) -> str:

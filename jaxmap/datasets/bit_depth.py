@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-Bits = Literal[8, 10, 12, 14, 16]
+from jaxmap.datasets.options import Bits
 
 BRIGHT_SHARE = 0.005
 """Share of the pixels that may be brighter than the range: hot pixels, dead columns, glints. They become white."""
@@ -42,6 +42,14 @@ def used_bits(images: Iterable[UInt16[np.ndarray, "H W *rgb"]]) -> BitDepth:
     bright = np.quantile(seen, 1 - BRIGHT_SHARE) if len(seen) else _TOP
     bits = next(bits for bits in get_args(Bits) if bright < 2**bits)
     return BitDepth(bits, float((values >= 2**bits).mean()))
+
+
+def bits_note(bits: int, brighter: float) -> str:
+    """What a reader tells of the depth that it found."""
+    return (
+        f"the 16-bit images are taken to use {bits} bits ({100 * brighter:.2g} % of their pixels are brighter, and "
+        "become white); --image-bits sets it"
+    )
 
 
 def to_8_bits(pixels: UInt8[np.ndarray, "H W *rgb"] | UInt16[np.ndarray, "H W *rgb"], bits: int) -> np.ndarray:

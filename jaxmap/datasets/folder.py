@@ -1,9 +1,8 @@
-"""Plain folders: `left/NAME.png`, `right/NAME.png`, `camera.yaml`, `poses.tum`."""
+"""Plain folders: `left/NAME.png`, `right/NAME.png` or the like, `camera.yaml`, `poses.tum`."""
 
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 
 import numpy as np
@@ -12,25 +11,39 @@ from jaxmap.datasets.base import UNPOSED, FrameRef, Reader, StereoSequence, asse
 from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.images import list_images
 from jaxmap.datasets.options import ReadOptions
-from jaxmap.datasets.poses import PoseTrack, read_timestamps
+from jaxmap.datasets.pair_files import is_number, is_time, pair_files, units_per_second
+from jaxmap.datasets.poses import PoseTrack, read_timestamps, with_timestamps
 from jaxmap.errors import JaxmapError
 
 _TIME_FILES = ("times.txt", "timestamps.txt")
 
-_MIN_UNIX_TIME_S = 1e8
+SIDES = (("left", "right"), ("image_left", "image_right"), ("image_0", "image_1"), ("cam0", "cam1"))
+"""Names of the two folders of images, in order of preference."""
+_OWN_FILES = ("camera.yaml", "poses.tum")
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds `left` and `right`."""
-    return (folder / "left").is_dir() and (folder / "right").is_dir()
+    """Whether the folder holds `left` and `right`, or others of `SIDES` and `camera.yaml` or `poses.tum`."""
+    sides = _sides(folder)
+    return sides is not None and (sides == SIDES[0] or any((folder / name).is_file() for name in _OWN_FILES))
+
+
+def _sides(folder: Path) -> tuple[str, str] | None:
+    return next((pair for pair in SIDES if all((folder / side).is_dir() for side in pair)), None)
+
+
+def _images(folder: Path) -> list[Path]:
+    """The images of one camera; those in `data`, as EuRoC's cameras have it, if there are none beside."""
+    inner = folder / "data"
+    return list_images(inner if inner.is_dir() else folder)
 
 
 def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
     """Opens a plain folder.
 
-    Images are `left/NAME` and `right/NAME`, of the same names, in the natural order of the names
-    (`f2` before `f10`). The calibration is `camera.yaml` (`calibration.read_camera_yaml` describes
-    it) or the one given; the poses are `poses.tum` or those given.
+    Images are `left/NAME` and `right/NAME`, in the natural order of the names (`f2` before `f10`). The folders may be
+    others of `SIDES`, and where names differ, `pair_files` says what makes a pair. The calibration is `camera.yaml`
+    (`calibration.read_camera_yaml` describes it) or the one given; the poses are `poses.tum` or those given.
 
     The times of the frames come from the first source that exists:
 
@@ -46,7 +59,10 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
     Raises:
         JaxmapError: a file is missing or malformed, counts disagree, or there are no times.
     """
-    images = list_images(folder / "left")
+    left, right = _sides(folder) or SIDES[0]
+    images = _images(folder / left)
+    pairs = pair_files(images, _images(folder / right))
+    partner, key = dict(zip(images, pairs.right, strict=True)), dict(zip(images, pairs.keys, strict=True))
     calibration = options.calibration or folder / "camera.yaml"
     if not calibration.is_file():
         raise JaxmapError(
@@ -54,10 +70,14 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
         )
     camera = read_camera_yaml(calibration)
     track = read_pose_track(options, folder / "poses.tum")
-    images, times_s, note = _timed_images(folder, images, track)
+    images, times_s, note = _timed_images(folder, images, key, track)
+    if track.timestamps_s is None:
+        # Before any image is left out: there is one pose for each.
+        track = with_timestamps(track, times_s)
     frames = [
-        FrameRef(image.stem, float(time_s), image, folder / "right" / image.name)
+        FrameRef(image.stem, float(time_s), image, right_image)
         for image, time_s in zip(images, times_s, strict=True)
+        if (right_image := partner[image]) is not None
     ]
     return assemble(
         name=Path(os.path.abspath(folder)).name,
@@ -67,11 +87,13 @@ def open_folder(folder: Path, options: ReadOptions) -> StereoSequence:
         track=track,
         camera=camera,
         options=options,
-        notes=[note],
+        notes=[*pairs.notes, note],
     )
 
 
-def _timed_images(folder: Path, images: list[Path], track: PoseTrack) -> tuple[list[Path], np.ndarray, str]:
+def _timed_images(
+    folder: Path, images: list[Path], key: dict[Path, str], track: PoseTrack
+) -> tuple[list[Path], np.ndarray, str]:
     """The images in order, their times in seconds, and a note on the source of the times."""
     for path in (folder / name for name in _TIME_FILES):
         if path.is_file():
@@ -80,12 +102,11 @@ def _timed_images(folder: Path, images: list[Path], track: PoseTrack) -> tuple[l
                 raise JaxmapError(
                     f"{len(times)} times for {len(images)} left images", where=path, fix="write one line for each image"
                 )
-            return images, times / _per_second(times), f"times of the frames from {path.name}"
-    if all(re.fullmatch(r"[0-9]+(\.[0-9]+)?", image.stem) and len(image.stem) < 40 for image in images):
-        images = sorted(images, key=lambda image: float(image.stem))
-        times = np.array([float(image.stem) for image in images])
-        if any("." in image.stem for image in images) or times.max() >= _MIN_UNIX_TIME_S:
-            return images, times / _per_second(times), "times of the frames from the file names"
+            return images, times / units_per_second(times), f"times of the frames from {path.name}"
+    if all(map(is_number, key.values())) and any(map(is_time, key.values())):
+        images = sorted(images, key=lambda image: float(key[image]))
+        times = np.array([float(key[image]) for image in images])
+        return images, times / units_per_second(times), "times of the frames from the file names"
     if track is UNPOSED or len(images) == len(track.T):
         if track is UNPOSED or track.timestamps_s is None:
             return images, np.arange(float(len(images))), "frames numbered 0, 1, 2 ... s, as no times are known"
@@ -96,11 +117,6 @@ def _timed_images(folder: Path, images: list[Path], track: PoseTrack) -> tuple[l
         where=folder,
         fix="write times.txt with one time in seconds per line",
     )
-
-
-def _per_second(times: np.ndarray) -> float:
-    largest = np.abs(times).max()
-    return next((count for least, count in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest >= least), 1.0)
 
 
 READER = Reader("folder", "a plain folder with left, right and camera.yaml", recognises, open_folder)

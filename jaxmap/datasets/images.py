@@ -6,41 +6,54 @@ Pillow reads them: unlike OpenCV it reports a truncated file instead of filling 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
-from PIL import Image
+from PIL import Image, ImageFile
 
+from jaxmap.datasets.bit_depth import BitDepth, to_8_bits, used_bits
+from jaxmap.datasets.options import Bits
 from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.host.pictures import open_picture, oriented, raw_mode, size_of, turn_of
+from jaxmap.models.tensor_files import shortened
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 
 _GREY_MODES = ("L", "LA", "La", "1")
 _DEEP_GREY_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _COLOUR_MODES = ("RGB", "RGBA", "RGBX", "RGBa", "P", "PA", "CMYK", "YCbCr", "HSV", "LAB")
 
+_FRAMES_TO_JUDGE = 8
+
 ImageArray = UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]
+Pixels = ImageArray | UInt16[np.ndarray, "H W"] | UInt16[np.ndarray, "H W 3"]
 
 
-def read_image(path: str | PathLike[str]) -> ImageArray:
+def read_image(path: str | PathLike[str], *, bits: Bits | None = None, as_shown: bool = False) -> ImageArray:
     """Reads an image as 8-bit grey or RGB.
 
-    Grey stays grey, RGB stays RGB, palettes and other colour spaces become RGB, and alpha is
-    dropped. 16-bit grey is shifted down to 8 bits from the smallest depth of 8, 10, 12, 14 or 16 bits
-    that holds its brightest pixel, because cameras store 10 and 12 bits in 16-bit files. The EXIF
-    orientation is not applied: a calibration refers to the pixels as they are stored.
+    Grey stays grey, RGB stays RGB, palettes and other colour spaces become RGB, and alpha is dropped. 16-bit grey and
+    RGB are shifted down to 8 bits from the bits they use.
+
+    Args:
+        path: PNG, JPEG, TIFF, BMP, PGM, PPM or WebP.
+        bits: how many a 16-bit image uses; by default what `bit_depth.used_bits` finds in this image.
+        as_shown: whether a photograph's rotation tag (EXIF orientation) is applied, as viewers do. By default pixels
+            come as they are stored, which is what a calibration refers to.
 
     Returns:
         uint8 (H, W) or (H, W, 3).
 
     Raises:
-        FrameError: the file is missing, truncated, not an image, or of another pixel type.
+        FrameError: the file is missing, truncated, not an image, too large, or of another pixel type.
     """
-    pixels = _read_pixels(Path(path))
-    return _to_8_bits(pixels, _significant_bits(pixels))
+    pixels = read_pixels(Path(path), as_shown=as_shown)
+    return to_8_bits(pixels, bits or used_bits([pixels]).bits) if pixels.dtype == np.uint16 else pixels
 
 
 def read_deep_image(path: Path) -> UInt16[np.ndarray, "H W"]:
@@ -49,30 +62,9 @@ def read_deep_image(path: Path) -> UInt16[np.ndarray, "H W"]:
     Raises:
         FrameError: the file is missing, truncated, or no 16-bit grey image.
     """
-    pixels = _read_pixels(path)
-    if pixels.dtype != np.uint16:
+    pixels = read_pixels(path)
+    if pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise FrameError("not 16-bit grey", where=path, fix="write 16-bit numbers")
-    return pixels
-
-
-def read_index_image(path: Path) -> UInt8[np.ndarray, "H W"]:
-    """Reads an image of class indices: 8-bit grey, or a palette image, whose indices are kept.
-
-    Raises:
-        FrameError: the file is missing, truncated, or has colours or more bits.
-    """
-    try:
-        with Image.open(path) as image:
-            image.load()
-            mode, pixels = image.mode, np.array(image)
-    except FileNotFoundError as fault:
-        raise FrameError("the label image is missing", where=path, fix="label every left image") from fault
-    except Exception as fault:
-        raise _unreadable(path, fault) from fault
-    if mode not in ("L", "P"):
-        raise FrameError(
-            f"a label image of type {mode}", where=path, fix="write class indices as 8-bit grey or palette"
-        )
     return pixels
 
 
@@ -81,16 +73,30 @@ def as_rgb(image: ImageArray) -> UInt8[np.ndarray, "H W 3"]:
     return np.broadcast_to(image[..., None], (*image.shape, 3)) if image.ndim == 2 else image
 
 
-def read_image_pair(left_path: Path, right_path: Path, where: object) -> tuple[ImageArray, ImageArray]:
-    """Reads the left and right image of a stereo pair.
+def read_image_pair(
+    left_path: Path,
+    right_path: Path,
+    where: object,
+    *,
+    bits: Bits | None = None,
+    size_px: tuple[int, int] | None = None,
+) -> tuple[ImageArray, ImageArray]:
+    """Reads the left and right image of a stereo pair, on the pixels as they are stored.
 
-    Where one is grey and the other RGB, both become grey (ITU-R 601 luma). Both sides of a 16-bit
-    pair are shifted by the same number of bits.
+    Where one is grey and the other RGB, both become grey (ITU-R 601 luma). Both sides of a 16-bit pair are shifted by
+    the same number of bits.
+
+    Args:
+        left_path: of the left image.
+        right_path: of the right image.
+        where: the pair, for errors.
+        bits: how many 16-bit images use; found from this pair alone by default.
+        size_px: (width, height) that both must declare before either is decoded.
 
     Raises:
-        FrameError: an image cannot be read, or the two differ in size.
+        FrameError: an image cannot be read, or has another size than asked for or than the other one.
     """
-    left, right = _read_pixels(left_path), _read_pixels(right_path)
+    left, right = (read_pixels(path, size_px=size_px) for path in (left_path, right_path))
     if left.shape[:2] != right.shape[:2]:
         sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
         raise FrameError(
@@ -98,24 +104,70 @@ def read_image_pair(left_path: Path, right_path: Path, where: object) -> tuple[I
             where=where,
             fix="both images of a pair must have one size",
         )
-    bits = max(_significant_bits(left), _significant_bits(right))
-    left, right = _to_8_bits(left, bits), _to_8_bits(right, bits)
+    deep = [image for image in (left, right) if image.dtype == np.uint16]
+    if deep:
+        bits = bits or used_bits(deep).bits
+        left, right = to_8_bits(left, bits), to_8_bits(right, bits)
     if left.ndim != right.ndim:
         left, right = (np.array(Image.fromarray(image).convert("L")) for image in (left, right))
     return left, right
 
 
-def image_size_px(path: Path) -> tuple[int, int]:
-    """The (width, height) of an image, from its header alone.
+def sequence_bits(pairs: Sequence[tuple[Path, Path]]) -> BitDepth | None:
+    """How many bits the images of a sequence use, judged from a few frames of both cameras.
+
+    It is decided once for all frames: a shift that changes from frame to frame would change their contrast.
+
+    Args:
+        pairs: left and right files.
+
+    Returns:
+        None where none of those images has more than 8 bits or can be read.
+    """
+    picked = np.unique(np.linspace(0, len(pairs) - 1, _FRAMES_TO_JUDGE).round().astype(int)) if pairs else []
+    images = []
+    for path in (path for index in picked for path in pairs[index]):
+        try:
+            with open_picture(path) as image:
+                deep = image.mode in _DEEP_GREY_MODES or has_deep_colours(image)
+            images += [pixels] if deep and (pixels := read_pixels(path)).dtype == np.uint16 else []
+        except FrameError:
+            continue
+    return used_bits(images) if images else None
+
+
+def image_size_px(path: Path, *, as_shown: bool = False) -> tuple[int, int]:
+    """The (width, height) of an image, from its header alone; stored, or as viewers show it.
 
     Raises:
         FrameError: the file is missing or not an image.
     """
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except Exception as fault:
-        raise _unreadable(path, fault) from fault
+    with open_picture(path, max_px=None) as image:
+        return size_of(image, as_shown=as_shown)
+
+
+def image_rotation_tag(path: Path) -> int:
+    """The rotation tag of an image (EXIF orientation, 1 for none), from its header alone.
+
+    Raises:
+        FrameError: the file is missing or not an image.
+    """
+    with open_picture(path, max_px=None) as image:
+        return turn_of(image).tag
+
+
+def rotation_notes(images: Sequence[Path]) -> list[str]:
+    """A note on the photographs whose rotation tag turns them; none where there are none."""
+    turned = []
+    for path in images:
+        with suppress(FrameError):
+            turned += [path.name] if image_rotation_tag(path) != 1 else []
+    if not turned:
+        return []
+    return [
+        f"{len(turned)} of {len(images)} images carry a rotation tag ({shortened(turned, 3)}) and are turned as "
+        "viewers show them; masks and labels lie on the turned pixels"
+    ]
 
 
 def first_image_size_px(left_paths: Iterable[Path], where: object) -> tuple[int, int]:
@@ -156,40 +208,65 @@ def _natural_key(file: Path) -> list[tuple[int, int, str]]:
     return [(1, int(chunk), "") if chunk.isascii() and chunk.isdigit() else (0, 0, chunk) for chunk in chunks]
 
 
-def _read_pixels(path: Path) -> np.ndarray:
-    """uint8 (H, W), uint8 (H, W, 3) or, for 16-bit grey, uint16 (H, W)."""
-    # On damaged files Pillow's decoders raise nearly anything.
-    try:
-        with Image.open(path) as image:
-            image.load()
-            if image.mode in _DEEP_GREY_MODES:
-                pixels = np.asarray(image)
-            elif image.mode in _GREY_MODES:
-                return np.array(image.convert("L"))
-            elif image.mode in _COLOUR_MODES:
-                return np.array(image.convert("RGB"))
-            else:
-                raise ValueError(f"pixels of type {image.mode}")
-    except Exception as fault:
-        raise _unreadable(path, fault) from fault
-    if pixels.min() < 0 or pixels.max() > 65535:
-        raise FrameError("pixels exceed 16 bits", where=path, fix="store the image as 8-bit or 16-bit grey, or RGB")
-    return pixels.astype(np.uint16)
+def read_pixels(path: Path, *, as_shown: bool = False, size_px: tuple[int, int] | None = None) -> Pixels:
+    """Reads an image with the bits that it has; see `read_image` and `read_image_pair` for the arguments.
+
+    Returns:
+        uint8 or uint16, (H, W) or (H, W, 3).
+
+    Raises:
+        FrameError: as `read_image`.
+    """
+    with open_picture(path) as image:
+        if size_px is not None and size_of(image) != size_px:
+            (width, height), (wanted_width, wanted_height) = size_of(image), size_px
+            raise FrameError(
+                f"the image is {width}x{height} px, the calibration is for {wanted_width}x{wanted_height} px",
+                where=path,
+                fix="give the calibration of these images",
+            )
+        turn = turn_of(image)
+        pixels = _decoded(image, path)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        if pixels.min() < 0 or pixels.max() > 65535:
+            raise FrameError("pixels exceed 16 bits", where=path, fix="store the image as 8-bit or 16-bit grey, or RGB")
+        pixels = pixels.astype(np.uint16)
+    return oriented(pixels, turn, as_shown=as_shown)
 
 
-def _unreadable(path: Path, fault: Exception) -> FrameError:
-    if isinstance(fault, FileNotFoundError):
-        return FrameError("the image is missing", where=path, fix="restore the file")
-    if isinstance(fault, Image.UnidentifiedImageError):
-        return FrameError("not an image of a known format", where=path, fix="replace the file")
-    return FrameError(f"the image cannot be read ({fault})", where=path, fix="replace the file by a whole 8-bit image")
+def _decoded(image: ImageFile.ImageFile, path: Path) -> np.ndarray:
+    if has_deep_colours(image):
+        return decode_deep(image, path)
+    image.load()
+    if image.mode in _DEEP_GREY_MODES:
+        return np.array(image)
+    if image.mode in _GREY_MODES:
+        return np.array(image.convert("L"))
+    if image.mode in _COLOUR_MODES:
+        return np.array(image.convert("RGB"))
+    raise ValueError(f"pixels of type {image.mode}")
 
 
-def _significant_bits(pixels: np.ndarray) -> int:
-    if pixels.dtype == np.uint8:
-        return 8
-    return next(bits for bits in (8, 10, 12, 14, 16) if int(pixels.max()) < 2**bits)
+def has_deep_colours(image: ImageFile.ImageFile) -> bool:
+    """Whether Pillow would cut or scale the bits of an image not yet decoded: 16-bit colours or alpha, deep PNM."""
+    decoder, _, _, arguments = image.tile[0] if image.tile else ("", None, 0, None)
+    if decoder == "ppm" and isinstance(arguments, tuple):
+        return arguments[-1] > 255
+    return image.mode in ("RGB", "RGBA", "RGBX", "LA") and ";16" in raw_mode(image)
 
 
-def _to_8_bits(pixels: np.ndarray, bits: int) -> np.ndarray:
-    return pixels if pixels.dtype == np.uint8 else (pixels >> (bits - 8)).astype(np.uint8)
+def decode_deep(image: ImageFile.ImageFile, path: Path) -> UInt16[np.ndarray, "H W *rgb"]:
+    """The pixels of an image that `has_deep_colours`, as 16-bit grey or RGB, without alpha.
+
+    Raises:
+        Exception: of many kinds, where the file is damaged.
+    """
+    grey = "L" in raw_mode(image)
+    # OpenCV keeps all bits, but fills up what a cut file lacks; Pillow refuses it.
+    image.load()
+    pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16 or pixels.shape[:2] != image.size[::-1]:
+        raise ValueError("16-bit colours of a rare kind")
+    if pixels.ndim == 3:
+        pixels = np.ascontiguousarray(pixels[..., 0] if grey else pixels[..., 2::-1])
+    return pixels

@@ -180,7 +180,7 @@ def open_katwijk(folder: Path, options: ReadOptions) -> StereoSequence:
     frames, image_notes = pair_images(folder / camera.folder)
     if options.poses:
         track, T_child_camera = read_pose_track(options, options.poses), None
-        east, north, _ = np.median(track.T[:, :3, 3], axis=0)
+        east, north, _ = np.nanmedian(track.T[:, :3, 3], axis=0)
         crs = CRS if 1e5 < east < 9e5 and 1e4 < north < 1e7 else None
         pose_notes = [] if crs or track is UNPOSED else ["the poses given are not UTM: name their system with --crs"]
     else:

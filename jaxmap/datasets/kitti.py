@@ -12,28 +12,33 @@ from jaxmap.datasets.calibration import read_camera_yaml
 from jaxmap.datasets.images import first_image_size_px, list_images
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.poses import read_timestamps, with_timestamps
+from jaxmap.datasets.projections import camera_of_projections
 from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
-from jaxmap.types import StereoCamera, make_stereo_camera
 
-_CAMERA_PAIRS = ((0, 1), (2, 3))
+CAMERAS = {"grey": (0, 1), "color": (2, 3)}
+"""Numbers of the left and the right camera by the names that `ReadOptions.camera` takes."""
 
 
 def recognises(folder: Path) -> bool:
     """Whether the folder holds `calib.txt` and `image_0` or `image_2`."""
-    return (folder / "calib.txt").is_file() and any((folder / f"image_{i}").is_dir() for i, _ in _CAMERA_PAIRS)
+    return (folder / "calib.txt").is_file() and any((folder / f"image_{left}").is_dir() for left, _ in CAMERAS.values())
 
 
 def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
-    """Opens one sequence: the grey pair (cameras 0 and 1), or the colour pair (2 and 3) without it.
+    """Opens one sequence: the pair asked for, else the grey one (cameras 0 and 1), else that of colour (2 and 3).
 
-    An image's number is its line in `times.txt` and in the poses, so images may be missing. KITTI's own
-    poses are those of camera 0; for the colour pair they are moved to camera 2.
+    An image's number is its line in `times.txt` and in the poses, so images may be missing. KITTI's own poses are
+    those of camera 0; for the colour pair they are moved to camera 2, 6 cm to the left. Labels must be of the left
+    camera of the pair.
 
     Raises:
         JaxmapError: a file is missing or malformed, or the counts of times and poses disagree.
     """
-    left, right = next((pair for pair in _CAMERA_PAIRS if (folder / f"image_{pair[0]}").is_dir()), _CAMERA_PAIRS[0])
+    there = [name for name, (left, _) in CAMERAS.items() if (folder / f"image_{left}").is_dir()]
+    whole = [name for name in there if (folder / f"image_{CAMERAS[name][1]}").is_dir()]
+    chosen = options.camera or next(iter(whole + there), "grey")
+    left, right = CAMERAS[chosen]
     absolute = Path(os.path.abspath(folder))
     times_s = read_timestamps(folder / "times.txt")
     frames = _frames(folder, left, right, times_s)
@@ -41,7 +46,7 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
     if options.calibration:
         camera = read_camera_yaml(options.calibration)
     else:
-        camera = _camera(
+        camera = camera_of_projections(
             P_left, P_right, first_image_size_px((frame.left for frame in frames), folder), folder / "calib.txt"
         )
 
@@ -50,7 +55,14 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
         track = with_timestamps(track, times_s)
     T_camera0_left = np.eye(4)
     T_camera0_left[:3, 3] = -np.linalg.solve(P_left[:, :3], P_left[:, 3])
-    notes = [f"{len(times_s) - len(frames)} of {len(times_s)} frames have no left image"] * (len(frames) < len(times_s))
+    notes = []
+    if options.camera is None and len(whole) > 1:
+        notes.append(
+            f"the {chosen} pair is taken, image_{left} and image_{right}; labels and poses given must be of "
+            f"image_{left}, or choose --camera color (image_2, image_3)"
+        )
+    if missing := len(times_s) - len(frames):
+        notes.append(f"{missing} of {len(times_s)} frames have no left image")
     return assemble(
         name=f"kitti_{absolute.name}",
         dataset="kitti",
@@ -66,7 +78,14 @@ def open_kitti(folder: Path, options: ReadOptions) -> StereoSequence:
 
 def _frames(folder: Path, left: int, right: int, times_s: np.ndarray) -> list[FrameRef]:
     frames = []
-    for image in list_images(folder / f"image_{left}"):
+    images = list_images(folder / f"image_{left}")
+    try:
+        partners = {path.stem: path for path in list_images(folder / f"image_{right}")}
+    except JaxmapError as fault:
+        raise JaxmapError(
+            f"the pair of image_{left} has no image_{right}", where=folder, fix="restore it, or choose another --camera"
+        ) from fault
+    for image in images:
         if not (image.stem.isascii() and image.stem.isdigit() and int(image.stem) < len(times_s)):
             raise JaxmapError(
                 f"{image.name} is none of the {len(times_s)} frames of times.txt",
@@ -74,7 +93,8 @@ def _frames(folder: Path, left: int, right: int, times_s: np.ndarray) -> list[Fr
                 fix="name images 000000.png, 000001.png and so on, one for each line of times.txt",
             )
         time_s = float(times_s[int(image.stem)])
-        frames.append(FrameRef(image.stem, time_s, image, folder / f"image_{right}" / image.name))
+        partner = partners.get(image.stem, folder / f"image_{right}" / image.name)
+        frames.append(FrameRef(image.stem, time_s, image, partner))
     return frames
 
 
@@ -103,20 +123,6 @@ def _projections(path: Path, left: int, right: int) -> tuple[np.ndarray, np.ndar
     return matrices[f"P{left}"], matrices[f"P{right}"]
 
 
-def _camera(P_left: np.ndarray, P_right: np.ndarray, size_px: tuple[int, int], path: Path) -> StereoCamera:
-    if not np.allclose(P_left[[0, 1, 1], [0, 1, 2]], P_right[[0, 1, 1], [0, 1, 2]], rtol=1e-3):
-        raise JaxmapError("the two cameras differ", where=path, fix="give a rectified pair, or a --calibration")
-    return make_stereo_camera(
-        fx_px=float(P_left[0, 0]),
-        fy_px=float(P_left[1, 1]),
-        cx_px=float(P_left[0, 2]),
-        cy_px=float(P_left[1, 2]),
-        baseline_m=float((P_left[0, 3] - P_right[0, 3]) / P_left[0, 0]),
-        doffs_px=float(P_right[0, 2] - P_left[0, 2]),
-        width_px=size_px[0],
-        height_px=size_px[1],
-        where=path,
-    )
-
-
-READER = Reader("kitti", "KITTI odometry, sequences/NN with image_0 and calib.txt", recognises, open_kitti)
+READER = Reader(
+    "kitti", "KITTI odometry, sequences/NN with image_0 and calib.txt", recognises, open_kitti, tuple(CAMERAS)
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -9,7 +10,7 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from jaxmap.datasets.base import FrameRef
-from jaxmap.datasets.images import read_index_image
+from jaxmap.datasets.masks import find_mask, read_values
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.files import check_regular
 from jaxmap.labels import IGNORE
@@ -27,12 +28,14 @@ class LabelFolder:
         soft: whether they are probabilities.
         class_count: the number of classes.
         labels_are: whether they label the raw or the rectified pixels of the left image.
+        rectify: the sequence's `rectify_labels`, for raw ones; the front end rectifies them where it is None.
     """
 
     folder: Path
     soft: bool
     class_count: int
     labels_are: Literal["raw", "rectified"]
+    rectify: Callable[[FrameRef, np.ndarray], np.ndarray] | None = None
 
     def read(self, ref: FrameRef, front_end: StereoFrontEnd) -> dict[str, np.ndarray]:
         """The labels of one frame on its rectified pixels, as the fields of `Frame` that they fill.
@@ -42,14 +45,19 @@ class LabelFolder:
         """
         path = self.folder / f"{ref.name}{'.npy' if self.soft else '.png'}"
         expected = (front_end.camera.height_px, front_end.camera.width_px)
-        labels = self._read_probabilities(path, *expected) if self.soft else self._read_indices(path)
+        labels = self._read_probabilities(path, *expected) if self.soft else self._read_indices(ref.name)
         _check_size(labels.shape, expected, path)
         if self.labels_are == "raw":
-            labels = front_end.rectify_labels(labels)
+            labels = self.rectify(ref, labels) if self.rectify else front_end.rectify_labels(labels)
         return {"class_probabilities" if self.soft else "labels": labels}
 
-    def _read_indices(self, path: Path) -> np.ndarray:
-        labels = read_index_image(path)
+    def _read_indices(self, name: str) -> np.ndarray:
+        path = find_mask(self.folder, name)
+        if path is None:
+            raise FrameError(
+                "the label image is missing", where=self.folder / f"{name}.png", fix="label every left image"
+            )
+        labels = read_values(path)
         highest = labels[labels != IGNORE].max(initial=0)
         if highest >= self.class_count:
             raise FrameError(
@@ -57,7 +65,7 @@ class LabelFolder:
                 where=path,
                 fix="give all --classes in order",
             )
-        return labels
+        return labels.astype(np.uint8)
 
     def _read_probabilities(self, path: Path, height: int, width: int) -> np.ndarray:
         try:
@@ -121,9 +129,9 @@ def open_label_folder(
     """
     if not folder.is_dir():
         raise JaxmapError("no such folder of labels", where=folder, fix="check --labels")
-    for suffix, soft in ((".png", False), (".npy", True)):
-        if (folder / f"{first_name}{suffix}").is_file():
-            return LabelFolder(folder, soft, class_count, labels_are)
+    soft = find_mask(folder, first_name) is None
+    if not soft or (folder / f"{first_name}.npy").is_file():
+        return LabelFolder(folder, soft, class_count, labels_are)
     raise JaxmapError(
         f"no {first_name}.png and no {first_name}.npy", where=folder, fix="name label files after the left images"
     )

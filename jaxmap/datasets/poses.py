@@ -1,4 +1,4 @@
-"""Poses: reading and writing pose files, checking, interpolating, turning z-up, splitting off the site origin.
+"""Poses: reading and writing pose files, checking, interpolating, splitting off the site origin.
 
 `T` maps points of the child frame (a camera or a body) into the world: `p_world = T @ p_child`.
 """
@@ -15,7 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
-from jaxmap.datasets.options import PosesWorld
+from jaxmap.datasets.options import QuaternionOrder, TimeUnit
+from jaxmap.datasets.pose_faults import find_wild_poses
+from jaxmap.datasets.pose_text import left_out, read_pose_text
 from jaxmap.datasets.text_files import data_lines
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
@@ -26,27 +28,38 @@ KNOT_TOLERANCE_S = 1e-3
 MAX_LOCAL_RANGE_M = 10_000.0
 """Smaller coordinates need no site origin: float32 resolves 1 mm there."""
 
-T_Z_UP_CAMERA_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Turns a camera-like world (x right, y down, z forward) into a z-up one: x to x, z to y, -y to z."""
-
-_TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_MIN_COLUMNS = 8, 12, 8
-
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """Valid poses in the order of time; made by `make_pose_track`.
+    """Poses in the order of time; made by `make_pose_track`.
 
     Attributes:
         timestamps_s: float64 (N,), strictly increasing; None where the file carries no times (KITTI).
-        T: float64 (N, 4, 4), rigid, T_world_camera or T_world_body.
+        T: float64 (N, 4, 4), rigid, T_world_camera or T_world_body; NaN throughout where the pose of that time is
+            unusable.
         child: the frame that `T` takes into the world.
         where: the file, for error messages.
+        lines: the line of each pose in the file; without it messages count rows from 1.
+        quaternion: the order that quaternions were read in.
+        time_unit: the unit that times were read in.
+        notes: what was assumed in reading.
+        faults: what of the file is left out.
     """
 
     timestamps_s: np.ndarray | None
     T: np.ndarray
     child: Literal["camera", "body"] = "camera"
     where: str = "poses"
+    lines: tuple[int, ...] | None = None
+    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    time_unit: TimeUnit = "s"
+    notes: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "N"]:
+        """Which times have a pose."""
+        return np.asarray(np.isfinite(self.T).all(axis=(1, 2)))
 
 
 def make_pose_track(
@@ -61,19 +74,20 @@ def make_pose_track(
 
     Args:
         timestamps_s: (N,) or None.
-        T: (N, 4, 4).
+        T: (N, 4, 4), NaN throughout where there is no pose.
         child: the frame that `T` takes into the world.
         where: the file, for error messages.
         lines: the line of each pose in the file; without it errors count rows from 1.
 
     Raises:
-        JaxmapError: no pose, a number that is not finite, a transform that is not rigid (within
-            1e-3), or times that do not increase; with the line.
+        JaxmapError: no pose, a number that is not finite among others that are, a transform that is not rigid
+            (within 1e-3), or times that do not increase; with the line.
     """
     T = np.array(T, np.float64)
     if T.ndim != 3 or T.shape[1:] != (4, 4):
         raise JaxmapError(f"poses have shape {T.shape}", where=where, fix="give 4x4 matrices")
-    if not len(T):
+    absent = np.isnan(T).all(axis=(1, 2))
+    if absent.all():
         raise JaxmapError("no poses", where=where, fix="give at least one pose")
 
     def refuse(bad: np.ndarray, what: str, fix: str) -> None:
@@ -82,14 +96,15 @@ def make_pose_track(
             place = f"row {row + 1}" if lines is None else f"line {lines[row]}"
             raise JaxmapError(f"{what} at {place}", where=where, fix=fix)
 
-    refuse(np.asarray(~np.isfinite(T).all(axis=(1, 2))), "a number that is not finite", "correct or remove the pose")
+    broken = ~absent & ~np.isfinite(T).all(axis=(1, 2))
+    refuse(np.asarray(broken), "a number that is not finite", "correct or remove the pose")
     R = T[:, :3, :3]
     with np.errstate(all="ignore"):
         error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         rigid = (error < 1e-3) & (np.linalg.det(R) > 0) & (np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1) < 1e-9)
-    refuse(~rigid, "the pose is not a rotation and a translation", "give rigid transforms")
-    U, _, Vt = np.linalg.svd(R)
-    T[:, :3, :3] = U @ Vt
+    refuse(~rigid & ~absent, "the pose is not a rotation and a translation", "give rigid transforms")
+    U, _, Vt = np.linalg.svd(R[~absent])
+    T[~absent, :3, :3] = U @ Vt
     if timestamps_s is not None:
         timestamps_s = np.array(timestamps_s, np.float64)
         if timestamps_s.shape != (len(T),):
@@ -97,48 +112,74 @@ def make_pose_track(
         refuse(~np.isfinite(timestamps_s), "a timestamp that is not finite", "correct or remove the pose")
         backwards = np.diff(timestamps_s, prepend=-np.inf) <= 0
         refuse(backwards, "timestamps go back or repeat", "sort the poses by time and drop repeated ones")
-    return PoseTrack(timestamps_s, T, child, str(where))
+    return PoseTrack(timestamps_s, T, child, str(where), None if lines is None else tuple(lines))
 
 
-def read_poses(path: Path) -> PoseTrack:
-    """Reads poses as TUM text, KITTI 3x4 text or EuRoC's ground-truth csv, recognised by content.
+def read_poses(path: Path, quaternion: QuaternionOrder = "auto", time_unit: TimeUnit = "auto") -> PoseTrack:
+    """Reads a text of poses, one a line, its form recognised by content.
 
-    TUM: `timestamp_s tx ty tz qx qy qz qw`. KITTI: twelve numbers, row-major 3x4, without times.
-    EuRoC: comma-separated `timestamp_ns, px, py, pz, qw, qx, qy, qz, ...`, poses of the body.
-    Empty lines and lines that start with `#` are ignored.
+    - TUM: `timestamp tx ty tz qx qy qz qw`, separated by spaces, commas or semicolons.
+    - KITTI: twelve or sixteen numbers, row-major 3x4 or 4x4, without times.
+    - EuRoC and VINS: comma-separated `timestamp_ns, px, py, pz, qw, qx, qy, qz, ...`, poses of the body.
+    - Any order of columns that a header names (`time`, `x y z`, `qx qy qz qw`, as TUM, EuRoC and ROS spell them).
+
+    Empty lines, lines that start with `#`, `%` or `//`, a header and a separator at the end of a line are passed over.
+    Times are in the unit that `time_unit` or the header says; else from 1e17 on in nanoseconds, from 1e14 on in
+    microseconds, from 1e11 on in milliseconds, below in seconds, or in nanoseconds in EuRoC's form.
+
+    Lines whose pose is not finite, or whose rotation is all zeros (tracking was lost), leave a time without a pose.
+    Lines that repeat a time are left out, lines out of order are sorted; `faults` counts all of them.
+
+    Args:
+        path: the file.
+        quaternion: the order of the four columns of the quaternion, where the form or the header does not say it.
+        time_unit: the unit of the times, likewise.
 
     Raises:
-        JaxmapError: none of the three, a line of another length, a word that is not a number, a
-            quaternion whose norm is not within 1e-2 of 1, or what `make_pose_track` refuses; with
-            the line.
+        JaxmapError: none of these forms, a line of another length, a word that is not a number, a quaternion whose
+            norm is not within 1e-2 of 1, or what `make_pose_track` refuses; with the line.
     """
-    rows = data_lines(path)
-    if not rows:
-        raise JaxmapError("no poses", where=path, fix="give TUM text, KITTI 3x4 text or EuRoC csv")
-    lines = [line for line, _ in rows]
-    by_comma = "," in rows[0][1]
-    fields = [[word.strip() for word in text.split(",")] if by_comma else text.split() for _, text in rows]
-    columns = len(fields[0])
-    if by_comma and columns >= _EUROC_MIN_COLUMNS:
-        timestamps_s = np.array(
-            [parse_ns(words[0], path, line) / 1e9 for line, words in zip(lines, fields, strict=True)]
-        )
-        values = _numbers(fields, path, lines, columns)
-        T = _from_quaternions(values[:, 1:4], values[:, [5, 6, 7, 4]], path, lines)
-        return make_pose_track(timestamps_s, T, child="body", where=path, lines=lines)
-    if not by_comma and columns == _TUM_COLUMNS:
-        values = _numbers(fields, path, lines, columns)
-        T = _from_quaternions(values[:, 1:4], values[:, 4:8], path, lines)
-        return make_pose_track(values[:, 0], T, where=path, lines=lines)
-    if not by_comma and columns == _KITTI_COLUMNS:
-        T = np.tile(np.eye(4), (len(lines), 1, 1))
-        T[:, :3] = _numbers(fields, path, lines, columns).reshape(-1, 3, 4)
-        return make_pose_track(None, T, where=path, lines=lines)
-    raise JaxmapError(
-        f"{columns} {'comma-separated ' if by_comma else ''}columns do not make a pose",
-        where=f"{path} line {lines[0]}",
-        fix="give TUM text (8 columns), KITTI 3x4 text (12) or EuRoC csv (8 or more, commas)",
+    rows = read_pose_text(path, quaternion, time_unit)
+    lines, times_s, T, faults = np.array(rows.lines, int), rows.times_s, rows.T, [*rows.faults]
+    if times_s is not None and len(times_s):
+        backwards = np.diff(times_s, prepend=times_s[0]) < 0
+        if backwards.any():
+            faults.append(f"times of the poses go back {backwards.sum()} times (line {lines[backwards][0]}): sorted")
+        order = np.argsort(times_s, kind="stable")
+        repeated = np.diff(times_s[order], prepend=-np.inf) == 0
+        faults += left_out(repeated, lines[order].tolist(), "of a time that is there already")
+        order = order[~repeated]
+        lines, times_s, T = lines[order], times_s[order], T[order]
+    track = make_pose_track(times_s, T, child=rows.child, where=path, lines=lines.tolist())
+    return replace(
+        track,
+        quaternion=rows.quaternion,
+        time_unit=rows.time_unit,
+        notes=tuple(rows.notes),
+        faults=tuple(f"{path.name}: {fault}" for fault in faults),
     )
+
+
+def without_wild_poses(track: PoseTrack) -> PoseTrack:
+    """A track with times, less the poses that a path cannot hold (`pose_faults.find_wild_poses`); `faults` tells.
+
+    Raises:
+        JaxmapError: the track has no timestamps.
+    """
+    knots_s = _knots_s(track)
+    rows = np.flatnonzero(track.usable)
+    found = find_wild_poses(knots_s[rows], track.T[rows])
+    wild = np.zeros(len(track.T), bool)
+    wild[rows[found.wild]] = True
+    lines = track.lines or range(1, len(track.T) + 1)
+    off = f"off the path by up to {found.away_m:.5g} m and {found.away_deg:.0f} deg"
+    faults = [f"{Path(track.where).name}: {fault}" for fault in left_out(wild, lines, off)]
+    notes = [*track.notes]
+    if found.kept_jump_m:
+        notes.append(f"the path of the poses jumps by {found.kept_jump_m:.3g} m: the map may show things twice")
+    T = track.T.copy()
+    T[wild] = np.nan
+    return replace(track, T=T, notes=tuple(notes), faults=(*track.faults, *faults))
 
 
 def read_timestamps(path: Path) -> Float64[np.ndarray, "N"]:
@@ -147,12 +188,18 @@ def read_timestamps(path: Path) -> Float64[np.ndarray, "N"]:
     Raises:
         JaxmapError: a line is not one finite number, with the line.
     """
-    rows = data_lines(path)
-    values = _numbers([text.split() for _, text in rows], path, [line for line, _ in rows], 1)[:, 0]
-    for (line, _), value in zip(rows, values, strict=True):
-        if not np.isfinite(value):
-            raise JaxmapError(f"{value} is not a time", where=f"{path} line {line}", fix="correct the line")
-    return values
+    values = []
+    for line, text in data_lines(path):
+        place = f"{path} line {line}"
+        if len(text.split()) != 1:
+            raise JaxmapError(f"{len(text.split())} columns, not 1", where=place, fix="correct or restore the file")
+        try:
+            values.append(float(text))
+        except ValueError as fault:
+            raise JaxmapError(f"{fault}"[:120], where=place, fix="correct or restore the file") from fault
+        if not np.isfinite(values[-1]):
+            raise JaxmapError(f"{values[-1]} is not a time", where=place, fix="correct the line")
+    return np.array(values, np.float64)
 
 
 def parse_ns(word: str, path: Path, line: int) -> int:
@@ -210,14 +257,13 @@ def poses_at(
     Returns:
         T: (M, 4, 4), NaN where there is no pose. At the time of a pose it is that pose, exactly.
         has_pose: (M,), false outside the track and inside gaps, except within `KNOT_TOLERANCE_S` of a
-            pose.
+            pose; false within that of a time whose pose is unusable.
 
     Raises:
         JaxmapError: the track has no timestamps.
     """
-    knots_s = track.timestamps_s
-    if knots_s is None:
-        raise JaxmapError("poses without times", where=track.where, fix="give poses with times (TUM text)")
+    all_knots_s, usable = _knots_s(track), track.usable
+    knots_s, T_knots = all_knots_s[usable], track.T[usable]
     last = len(knots_s) - 1
     after = np.clip(np.searchsorted(knots_s, timestamps_s, side="right"), min(1, last), last)
     before = np.maximum(after - 1, 0)
@@ -231,26 +277,18 @@ def poses_at(
 
     T = np.full((len(timestamps_s), 4, 4), np.nan)
     between = inside & (fraction > 0) & (fraction < 1)
-    T[between] = _interpolate(track.T[before[between]], track.T[after[between]], fraction[between])
+    T[between] = _interpolate(T_knots[before[between]], T_knots[after[between]], fraction[between])
     on_knot = near & ~between
-    T[on_knot] = track.T[nearest[on_knot]]
-    return T, between | on_knot
-
-
-def to_z_up(
-    T: Float64[np.ndarray, "N 4 4"], world: PosesWorld
-) -> tuple[Float64[np.ndarray, "N 4 4"], Float64[np.ndarray, "4 4"]]:
-    """Camera poses in a z-up world, and the transform from their own world into it.
-
-    A `camera` world (KITTI's) is x right, y down, z forward: x becomes x, z becomes y, -y becomes z.
-    `auto` takes the world for a camera world if the mean of the cameras' up axes (-y) points clearly
-    along its -y, else for z-up.
-    """
-    if world == "auto":
-        up_world = -T[:, :3, 1].mean(axis=0)
-        world = "camera" if -up_world[1] > 0.8 and -up_world[1] > abs(up_world[2]) else "z_up"
-    T_world_source = T_Z_UP_CAMERA_WORLD.copy() if world == "camera" else np.eye(4)
-    return T_world_source @ T, T_world_source
+    T[on_knot] = T_knots[nearest[on_knot]]
+    has_pose = between | on_knot
+    if not usable.all():
+        # A frame taken when tracking was lost is no place to trust a pose between others.
+        lost_s = all_knots_s[~usable]
+        after = np.searchsorted(lost_s, timestamps_s).clip(0, len(lost_s) - 1)
+        from_lost_s = np.minimum(*(np.abs(timestamps_s - lost_s[row]) for row in (np.maximum(after - 1, 0), after)))
+        has_pose &= on_knot | (from_lost_s > KNOT_TOLERANCE_S)
+        T[~has_pose] = np.nan
+    return T, has_pose
 
 
 def split_site_origin(
@@ -272,39 +310,10 @@ def split_site_origin(
     return relative, site_origin
 
 
-def _numbers(fields: list[list[str]], path: Path, lines: Sequence[int], columns: int) -> np.ndarray:
-    values = np.empty((len(fields), columns))
-    for row, (line, words) in enumerate(zip(lines, fields, strict=True)):
-        if len(words) != columns:
-            raise JaxmapError(
-                f"{len(words)} columns, not {columns}", where=f"{path} line {line}", fix="correct or restore the file"
-            )
-        try:
-            values[row] = [float(word) for word in words]
-        except ValueError as fault:
-            raise JaxmapError(
-                f"{fault}"[:120], where=f"{path} line {line}", fix="correct or restore the file"
-            ) from fault
-    return values
-
-
-def _from_quaternions(
-    positions: np.ndarray, quaternions_xyzw: np.ndarray, path: Path, lines: Sequence[int]
-) -> np.ndarray:
-    with np.errstate(all="ignore"):
-        norms = np.linalg.norm(quaternions_xyzw, axis=1)
-    bad = ~(np.abs(norms - 1) < 1e-2)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise JaxmapError(
-            f"the quaternion has norm {norms[row]:g}, not 1",
-            where=f"{path} line {lines[row]}",
-            fix="check the order of the columns",
-        )
-    T = np.tile(np.eye(4), (len(positions), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(quaternions_xyzw).as_matrix()
-    T[:, :3, 3] = positions
-    return T
+def _knots_s(track: PoseTrack) -> np.ndarray:
+    if track.timestamps_s is None:
+        raise JaxmapError("poses without times", where=track.where, fix="give poses with times (TUM text)")
+    return track.timestamps_s
 
 
 def _interpolate(T_before: np.ndarray, T_after: np.ndarray, fraction: np.ndarray) -> np.ndarray:

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmap.datasets import euroc, folder, katwijk, kitti, rosbag
+from jaxmap.datasets import (
+    asp,
+    euroc,
+    folder,
+    katwijk,
+    kitti,
+    madmax,
+    middlebury,
+    planetary,
+    rosbag,
+    tartanair,
+)
 from jaxmap.datasets.base import OnFrame, Reader, StereoSequence, from_images
 from jaxmap.datasets.crs import check_crs
 from jaxmap.datasets.options import ReadOptions
@@ -15,7 +26,19 @@ from jaxmap.errors import JaxmapError, UsageError
 SAMPLE_PREFIX = "sample:"
 
 READERS: dict[str, Reader] = {
-    reader.name: reader for reader in (kitti.READER, euroc.READER, folder.READER, katwijk.READER, rosbag.READER)
+    module.READER.name: module.READER
+    for module in (
+        kitti,
+        euroc,
+        folder,
+        katwijk,
+        planetary,
+        asp,
+        rosbag,
+        madmax,
+        tartanair,
+        middlebury,
+    )
 }
 
 
@@ -55,7 +78,7 @@ def open_sequence(
         return _posed(open_sample(str(source).removeprefix(SAMPLE_PREFIX), options), options, on_frame)
     path = Path(source)
     if not path.is_dir() and not (path.is_file() and any(reader.recognises(path) for reader in READERS.values())):
-        what = f"{source} is a file, and no bag" if path.exists() else f"there is no folder {source}"
+        what = f"{source} is a file, but no bag" if path.exists() else f"there is no folder {source}"
         raise JaxmapError(what, fix="give the folder of one sequence, a bag, or sample:NAME")
     reader = READERS[options.dataset] if options.dataset != "auto" else _recognise(path)
     if options.camera is not None and options.camera not in reader.cameras:
@@ -73,9 +96,10 @@ def _recognise(path: Path) -> Reader:
     """The one reader that recognises a folder."""
     fitting = [reader for reader in READERS.values() if reader.recognises(path)]
     if not fitting:
-        known = "; ".join(f"{reader.name}: {reader.help}" for reader in READERS.values())
         raise JaxmapError(
-            "no data set is recognised", where=path, fix=f"looked for {known}. Give the folder of one sequence"
+            f"no data set is recognised: looked for what marks {', '.join(READERS)}",
+            where=path,
+            fix="give the folder of one sequence; jaxmap info says what each must hold",
         )
     if len(fitting) > 1:
         names = " and ".join(reader.name for reader in fitting)

@@ -30,9 +30,9 @@ from jaxmap.datasets.bag_topics import (
     is_rectified_name,
 )
 from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, from_images, read_pose_track
-from jaxmap.datasets.bit_depth import used_bits
+from jaxmap.datasets.bit_depth import bits_note, used_bits
 from jaxmap.datasets.calibration import read_camera_yaml
-from jaxmap.datasets.options import ReadOptions
+from jaxmap.datasets.options import Bits, ReadOptions
 from jaxmap.datasets.pairing import nearest_pairs
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
@@ -56,6 +56,9 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
     by_gps = poses is not None and bag.topics[poses].type == FIX_TYPE
     imu = attitude_topic(bag.topics, options.bag, path) if by_gps else None
     log = read_log(bag, {*pair, *infos, *(name for name in (poses, gps, imu) if name is not None)})
+    for topic in (*pair, *infos):
+        if topic not in (log.infos if topic in infos else log.shots):
+            raise JaxmapError(f"no message of {topic} can be found", where=path, fix="restore the bag, or reindex it")
 
     shots, more = _pair_shots(log, pair, options.bag.max_pair_gap_s, path)
     notes += more + _notes_on_log(log, infos)
@@ -66,7 +69,8 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
         found = _bag_poses(log, (poses, bag.topics[poses].type), imu, shots[0][0].frame, times_s, options)
     if gps is not None and imu is None and not from_images(options):
         found = georeferenced(found, log, gps, options)
-    reader = _PairReader(bag, pair, {str(left.time_ns): (left.place, right.place) for left, right in shots})
+    places = {str(left.time_ns): (left.place, right.place) for left, right in shots}
+    reader = _PairReader(bag, pair, places, options.image_bits)
     camera, more = _camera(log, infos, pair, shots[0], times_s, options)
     usual = Counter(left.size_px for left, _ in shots if left.size_px).most_common(1)
     return assemble(
@@ -82,7 +86,7 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
         options=options,
         T_child_camera=found.T_child_camera,
         crs=found.crs,
-        notes=[*notes, *more, *found.notes],
+        notes=[*notes, *reader.notes, *more, *found.notes],
         read_pair=reader,
         size_px=usual[0][0] if usual else reader.size_px,
     )
@@ -189,9 +193,12 @@ class _PairReader:
 
     Attributes:
         size_px: width and height of the first image that can be decoded.
+        notes: how many bits were found.
     """
 
-    def __init__(self, bag: Bag, pair: PairTopics, places: Mapping[str, tuple[Place, Place]]) -> None:
+    def __init__(
+        self, bag: Bag, pair: PairTopics, places: Mapping[str, tuple[Place, Place]], bits: Bits | None
+    ) -> None:
         """Decodes a few pairs.
 
         Raises:
@@ -210,7 +217,10 @@ class _PairReader:
             raise fault
         self.size_px = (probes[0].shape[1], probes[0].shape[0])
         deep = [image for image in probes if image.dtype == np.uint16]
-        self._bits = used_bits(deep).bits if deep else 8
+        self.notes, self._bits = [], bits or 16
+        if deep and bits is None:
+            self._bits, brighter = used_bits(deep)
+            self.notes.append(bits_note(self._bits, brighter))
 
     def __call__(self, frame: FrameRef) -> StereoPair:
         """The pair of a frame.

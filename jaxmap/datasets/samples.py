@@ -68,6 +68,7 @@ def _open_motorcycle(options: ReadOptions) -> StereoSequence:
         else make_pose_track(np.zeros(1), np.eye(4)[None]),
         camera=read_camera_yaml(options.calibration) if options.calibration else camera,
         options=options,
+        true_disparity=lambda frame: motorcycle_disparity(),
     )
 
 

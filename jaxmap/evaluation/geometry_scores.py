@@ -29,9 +29,11 @@ class DisparityScores(NamedTuple):
 def score_disparity(
     disparity_px: Float[np.ndarray, "H W"], true_disparity_px: Float[np.ndarray, "H W"]
 ) -> DisparityScores:
-    """Compares disparities; NaN is unknown in both."""
+    """Compares disparities; NaN is unknown in both. The errors are NaN where no pixel has both."""
     error_px = np.abs(disparity_px - true_disparity_px)
     error_px = error_px[np.isfinite(error_px)]
+    if not error_px.size:
+        return DisparityScores(float("nan"), float("nan"), float(np.isfinite(disparity_px).mean()))
     return DisparityScores(
         median_error_px=float(np.median(error_px)),
         bad_2=float((error_px > 2.0).mean()),

@@ -63,6 +63,17 @@ def most_memory_bytes() -> int:
     return min(limits)
 
 
+def available_bytes() -> int | None:
+    """The memory that a program may still take, or None where the system does not say."""
+    status = Path("/proc/meminfo")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name == "MemAvailable":
+                return int(value.split()[0]) * 2**10
+    return None
+
+
 def _is_supported() -> bool:
     """Whether the C library is a glibc that has these settings."""
     library, version = platform.libc_ver()

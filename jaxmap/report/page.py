@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.files import atomic_path
 
 if TYPE_CHECKING:
@@ -116,20 +116,20 @@ def inline_image(path: Path, alt: str, *, width_px: int | None = None) -> str:
     Raises:
         JaxmapError: the picture cannot be read.
     """
-    from PIL import Image, UnidentifiedImageError
+    from jaxmap.host.pictures import open_picture
 
     try:
-        content, kind = path.read_bytes(), "png"
-        with Image.open(io.BytesIO(content)) as image:
-            image.load()
+        with open_picture(path) as picture:
+            picture.load()
+            content, kind, image = path.read_bytes(), "png", picture
             if width_px is not None:
-                image = image.convert("RGB")
+                image = picture.convert("RGB")
                 image.thumbnail((width_px, width_px * 4))
                 buffer = io.BytesIO()
                 image.save(buffer, "webp", quality=86)
                 content, kind = buffer.getvalue(), "webp"
             size = image.size
-    except (OSError, ValueError, SyntaxError, UnidentifiedImageError) as error:
+    except FrameError as error:
         raise JaxmapError("not a readable picture", where=path, fix="remove it or map again") from error
     data = base64.b64encode(content).decode("ascii")
     return f'<img src="data:image/{kind};base64,{data}" alt="{escape(alt)}" width="{size[0]}" height="{size[1]}">'

@@ -12,13 +12,13 @@ from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 
 from jaxmap.datasets.poses import read_poses
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
 from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
 from jaxmap.host.bounded_text import YAML_BOUNDS, read_json, read_text
+from jaxmap.host.pictures import open_picture
 from jaxmap.labels import class_colours
 from jaxmap.mapping.store import MapAttributes, load_map
 from jaxmap.report.image_colours import SeenFrame, image_colours
@@ -313,7 +313,7 @@ def seen_frames(contents: RunContents) -> list[SeenFrame]:
     poses = camera.get("key_frames")
     for name, pose in poses.items() if isinstance(poses, dict) else ():
         try:
-            with Image.open(contents.pictures[name]["left"]) as image:
+            with open_picture(contents.pictures[name]["left"]) as image:
                 pixels = np.asarray(image)
             frames.append(
                 SeenFrame(
@@ -323,7 +323,7 @@ def seen_frames(contents: RunContents) -> list[SeenFrame]:
                     (camera["cx_px"], camera["cy_px"]),
                 )
             )
-        except (OSError, KeyError, ValueError, TypeError):
+        except (FrameError, KeyError, ValueError, TypeError):
             continue
     return frames
 

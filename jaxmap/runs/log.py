@@ -10,6 +10,7 @@ from annotated_types import Interval
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from jaxmap.errors import JaxmapError
+from jaxmap.evaluation.geometry_scores import DisparityScores
 from jaxmap.mapping.sequence import FusedFrame
 
 MOST_KEPT = 2048
@@ -66,6 +67,7 @@ class RunLog:
         valid_fractions: share of a frame's pixels that have a disparity.
         points_fused: points that the labeller kept.
         without_ground: frames in which the labeller found no ground below the camera; None where it looks for none.
+        disparity: scores of the disparity of frames whose truth is known, by name.
         total_s: time spent on frames.
         compile_s: time spent on compiling.
         temporary_bytes: memory that the step takes beside the map.
@@ -82,6 +84,7 @@ class RunLog:
     valid_fractions: Sample = field(default_factory=Sample)
     points_fused: Count = 0
     without_ground: Count | None = None
+    disparity: dict[str, Sample] = field(default_factory=dict)
     total_s: Seconds = 0.0
     compile_s: Seconds = 0.0
     temporary_bytes: Count = 0
@@ -104,6 +107,11 @@ class RunLog:
         # Of the plane labeller as of those that see relief.
         if (found := getattr(fused.info.estimate, "found", None)) is not None:
             self.without_ground = (self.without_ground or 0) + (not bool(found))
+
+    def add_scores(self, scores: DisparityScores) -> None:
+        """Takes note of how near the truth a frame's disparity is."""
+        for name, value in scores._asdict().items():
+            self.disparity.setdefault(name, Sample()).add(value)
 
     def as_json(self) -> dict[str, Any]:
         """The log as plain values."""

@@ -11,6 +11,7 @@ import numpy as np
 import jaxmap
 from jaxmap.ensemble.layer import named_layers
 from jaxmap.errors import JaxmapError
+from jaxmap.evaluation.geometry_scores import score_disparity
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
@@ -87,6 +88,7 @@ def run_plan(
                 key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             log.add(fused)
             if fused.info is not None:
+                _score_disparity(plan, log, fused.prepared)
                 step_profile.step_done()
             on_frame(fused)
             if time.perf_counter() - saved_s > checkpoint_every_s:
@@ -117,8 +119,35 @@ def run_plan(
     return metrics
 
 
+def _score_disparity(plan: Plan, log: RunLog, prepared: PreparedFrame) -> None:
+    """Compares the disparity of a rectified frame with its truth, where that is known.
+
+    Raises:
+        JaxmapError: the truth cannot be read, or is of another size.
+    """
+    read, rectified = plan.sequence.true_disparity, prepared.rectified
+    if read is None or rectified is None or plan.front_end.rectifier is not None:
+        return
+    truth_px = read(prepared.ref)
+    if truth_px is None:
+        return
+    if truth_px.shape != rectified.disparity_px.shape:
+        size, expected = (f"{shape[1]}x{shape[0]}" for shape in (truth_px.shape, rectified.disparity_px.shape))
+        raise JaxmapError(
+            f"the true disparity is {size} px, the image {expected} px",
+            where=f"frame {prepared.ref.name}",
+            fix="give the truth of this image, or remove it",
+        )
+    log.add_scores(score_disparity(rectified.disparity_px, truth_px))
+
+
 def _notes(log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
+    if scores := metrics.get("disparity"):
+        yield (
+            f"against the true disparity: median error {scores['median_error_px']:.2f} px, {scores['bad_2']:.1%} off "
+            f"by more than 2 px, {scores['valid']:.0%} of the pixels matched"
+        )
     if log.without_ground:
         yield (
             f"no ground below the camera in {log.without_ground} of {log.fused} frames: nothing there is sand or rock "
@@ -260,6 +289,11 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             "valid_fraction": round(log.valid_fractions.percentile(50), 4),
             "fused": log.points_fused,
         },
+        **(
+            {"disparity": {name: round(sample.total / sample.count, 4) for name, sample in log.disparity.items()}}
+            if log.disparity
+            else {}
+        ),
         "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),
         "memory": {
             "map_mib": round(voxel_map.log_odds.nbytes / 2**20, 2),

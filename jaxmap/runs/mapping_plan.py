@@ -143,13 +143,14 @@ def choose_label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFol
         raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
     labels_are = config.labels_are
     if labels_are == "auto":
-        if isinstance(sequence.camera, StereoRig):
+        if isinstance(sequence.camera, StereoRig) or sequence.rectify_labels is not None:
             raise UsageError(
                 "the images are raw, and labels may lie on raw or on rectified pixels",
                 fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
             )
         labels_are = "rectified"
-    return open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
+    folder = open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
+    return replace(folder, rectify=sequence.rectify_labels)
 
 
 def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
@@ -304,6 +305,8 @@ def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame =
         JaxmapError: the data or the settings do not serve.
     """
     sequence = open_sequence(source, config, on_frame)
+    if config.strict and sequence.pose_faults:
+        raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
     front_end = StereoFrontEnd(sequence.camera, config.stereo)
     camera = front_end.camera
     _describe_sequence(sequence, camera, notify)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -10,14 +12,18 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from jaxmap.datasets.images import as_rgb, list_images, read_image, read_index_image
+from jaxmap.datasets.images import as_rgb, image_size_px, list_images, read_image
+from jaxmap.datasets.masks import MaskLookup, find_mask, read_labels, unlabelled_notes
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.host.files import atomic_path
+from jaxmap.host.memory import available_bytes
+from jaxmap.labels import ANY_OTHER, IGNORE
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import Images, Weights, inference_network
 from jaxmap.models.pixelwise import check_size, resized_input, resized_output
 from jaxmap.report.pictures import overlay_labels
+from jaxmap.runs.large_pictures import LARGE_PX, OVERVIEW_PX, Size, enlarged, read_decimated
 
 
 class Segmenter:
@@ -33,6 +39,7 @@ class Segmenter:
 
     def __init__(self, model: SavedModel, size: tuple[int, int] | None = None) -> None:
         check_size(size, "--size")
+        self.size = size
         network = inference_network(model.architecture, model.weights)
         self.classes, self._weights = network.architecture.classes, network.weights
 
@@ -48,16 +55,26 @@ class Segmenter:
         Raises:
             JaxmapError: the image is too large for the memory.
         """
+        height, width = image.shape[:2]
+        too_large = JaxmapError(
+            f"an image of {width}x{height} px takes more memory than there is",
+            where="the network",
+            fix="run it smaller with --size H W",
+        )
+        if height * width > LARGE_PX and self._needed_bytes((height, width)) > (available_bytes() or float("inf")):
+            raise too_large
         try:
             return np.asarray(self._run(self._weights, as_rgb(image)[None])[0])
         except (jax.errors.JaxRuntimeError, MemoryError) as fault:
             if isinstance(fault, MemoryError) or "RESOURCE_EXHAUSTED" in str(fault):
-                raise JaxmapError(
-                    f"an image of {image.shape[1]}x{image.shape[0]} px takes more memory than there is",
-                    where="the network",
-                    fix="run it smaller with --size H W",
-                ) from fault
+                raise too_large from fault
             raise
+
+    def _needed_bytes(self, size: Size) -> float:
+        """What a run takes, as the compiler says: a process that takes more than there is would be killed."""
+        image = jax.ShapeDtypeStruct((1, *size, 3), np.uint8)
+        costs = self._run.lower(self._weights, image).compile().memory_analysis()
+        return 0.0 if costs is None else float(costs.temp_size_in_bytes + costs.output_size_in_bytes)
 
 
 def find_images(sources: Sequence[Path]) -> list[Path]:
@@ -123,49 +140,133 @@ def check_outputs(images: Sequence[Path], out: Path, *, inputs: Sequence[Path], 
 
 
 def find_masks(images: Sequence[Path], folder: Path) -> list[Path]:
-    """The mask `NAME.png` of every image.
+    """The mask of every image: `NAME.png`, or of another of `MASK_SUFFIXES`.
 
     Raises:
         JaxmapError: masks are missing; all are named.
     """
-    masks = [folder / f"{image.stem}.png" for image in images]
-    missing = [mask.name for mask in masks if not mask.is_file()]
+    found = {image.stem: find_mask(folder, image.stem) for image in images}
+    missing = [f"{name}.png" for name, mask in found.items() if mask is None]
     if missing:
         raise JaxmapError(
-            f"{len(missing)} of {len(masks)} masks are missing: {', '.join(missing[:5])}",
+            f"{len(missing)} of {len(found)} masks are missing: {', '.join(missing[:5])}",
             where=folder,
             fix="name each mask after its image",
         )
-    return masks
+    return [mask for mask in found.values() if mask is not None]
 
 
-def check_masks(images: Sequence[Path], masks: Sequence[Path], class_count: int) -> None:
+def check_masks(images: Sequence[Path], masks: Sequence[Path], lookup: MaskLookup) -> list[str]:
     """Reads every mask once, before the long work starts.
 
+    Returns:
+        A note where the masks label hardly anything.
+
     Raises:
-        JaxmapError: a mask that cannot be read, of another size than its image, or with wrong labels.
+        JaxmapError: an image or a mask that cannot be read, a mask of another size than its image, or with values that
+            stand for nothing.
     """
+    held: set[int] = set()
     for image, mask in zip(images, masks, strict=True):
-        check_mask(read_index_image(mask), read_image(image).shape[:2], class_count, mask)
+        labels = read_labels(mask, lookup)
+        held |= set(np.unique(labels).tolist())
+        width, height = image_size_px(image, as_shown=True)
+        known = labels if lookup.negated is None else np.where(labels == ANY_OTHER, np.uint8(IGNORE), labels)
+        check_mask(known, (height, width), len(lookup.classes), mask)
+    return unlabelled_notes(lookup, held)
+
+
+@dataclass(frozen=True)
+class LabelWriter:
+    """Labels images and writes `NAME.png`, `NAME_overlay.png` and, if asked, `NAME_logits.npy`, each atomically.
+
+    Attributes:
+        segmenter: the network.
+        out: the folder to write.
+        lookup: what the pixels of masks stand for.
+        save_logits: whether the logits are written as well.
+    """
+
+    segmenter: Segmenter
+    out: Path
+    lookup: MaskLookup
+    save_logits: bool = False
+
+    def label(self, path: Path, mask: Path | None, scores: SegmentationScores) -> None:
+        """Labels one image, as viewers show it, and scores the labels against a mask.
+
+        Raises:
+            FrameError: the image cannot be read.
+            JaxmapError: it is too large for the memory, the mask does not fit, or writing failed.
+        """
+        (width, height), wanted = image_size_px(path, as_shown=True), self.segmenter.size
+        if wanted is not None and width * height > LARGE_PX and wanted[0] * wanted[1] <= LARGE_PX:
+            self._label_large(path, mask, scores, (height, width), wanted)
+            return
+        try:
+            image = read_image(path, as_shown=True)
+        except FrameError as fault:
+            if wanted is None and width * height > LARGE_PX:
+                raise FrameError(fault.what, where=path, fix="run it smaller with --size H W, or cut it up") from fault
+            raise
+        logits = self.segmenter.logits(image)
+        labels = logits.argmax(axis=-1).astype(np.uint8)
+        self._write(path, labels, overlay_labels(image, labels, self.segmenter.classes))
+        if self.save_logits:
+            with atomic_path(self.out / f"{path.stem}_logits.npy") as temporary:
+                np.save(temporary, logits.astype(np.float32))
+        if mask is not None:
+            scores.add(read_labels(mask, self.lookup), logits, mask)
+
+    def _label_large(self, path: Path, mask: Path | None, scores: SegmentationScores, size: Size, wanted: Size) -> None:
+        """The same for a picture that is never held as more than one number a pixel; its overlay is smaller than it."""
+        height, width = size
+        free = available_bytes()
+        # Its labels, and as much again while they are compressed.
+        if free is not None and 2 * height * width > free:
+            raise FrameError(
+                f"the labels of an image of {width}x{height} px take more memory than there is",
+                where=path,
+                fix="cut it into tiles",
+            )
+        logits = self.segmenter.logits(read_decimated(path, wanted))
+        truth = None if mask is None else read_labels(mask, self.lookup)
+        labels, counted = np.empty(size, np.uint8), scores.images
+        with ExitStack() as stack:
+            kept = None
+            if self.save_logits:
+                temporary = stack.enter_context(atomic_path(self.out / f"{path.stem}_logits.npy"))
+                kept = np.lib.format.open_memmap(temporary, "w+", np.float32, (*size, logits.shape[2]))
+            for rows, band in enlarged(logits, size):
+                labels[rows] = band.argmax(axis=-1)
+                if kept is not None:
+                    kept[rows] = band
+                if truth is not None:
+                    scores.add(truth[rows], band, mask)
+                    scores.images = counted + 1
+        step = -(-max(size) // OVERVIEW_PX)
+        small = labels[::step, ::step]
+        self._write(path, labels, overlay_labels(read_decimated(path, small.shape), small, self.segmenter.classes))
+
+    def _write(self, path: Path, labels: np.ndarray, overlay: np.ndarray) -> None:
+        for suffix, picture in (("", labels), ("_overlay", overlay)):
+            with atomic_path(self.out / f"{path.stem}{suffix}.png") as temporary:
+                Image.fromarray(picture).save(temporary)
 
 
 def label_images(
-    segmenter: Segmenter,
+    writer: LabelWriter,
     images: Sequence[Path],
-    out: Path,
-    *,
     masks: Sequence[Path] = (),
-    save_logits: bool = False,
+    *,
     advance: Callable[[int], None] = lambda done: None,
 ) -> tuple[SegmentationScores, list[FrameError]]:
-    """Labels images and writes `NAME.png`, `NAME_overlay.png` and, if asked, `NAME_logits.npy`, each atomically.
+    """Labels images, and scores the labels.
 
     Args:
-        segmenter: the network.
+        writer: the network, and where to write.
         images: files to label.
-        out: the folder to write.
         masks: the true labels of each image, or none.
-        save_logits: whether the logits are written as well.
         advance: takes the number of images done so far.
 
     Returns:
@@ -174,23 +275,11 @@ def label_images(
     Raises:
         JaxmapError: an image is too large for the memory, a mask does not fit, or writing failed.
     """
-    scores, faults = SegmentationScores.empty(segmenter.classes), []
+    scores, faults = SegmentationScores.empty(writer.segmenter.classes, writer.lookup.negated), []
     for index, path in enumerate(images):
         try:
-            image = read_image(path)
+            writer.label(path, masks[index] if masks else None, scores)
         except FrameError as fault:
             faults.append(fault)
-        else:
-            logits = segmenter.logits(image)
-            labels = logits.argmax(axis=-1).astype(np.uint8)
-            overlay = overlay_labels(image, labels, segmenter.classes)
-            for suffix, picture in (("", labels), ("_overlay", overlay)):
-                with atomic_path(out / f"{path.stem}{suffix}.png") as temporary:
-                    Image.fromarray(picture).save(temporary)
-            if save_logits:
-                with atomic_path(out / f"{path.stem}_logits.npy") as temporary:
-                    np.save(temporary, logits.astype(np.float32))
-            if masks:
-                scores.add(read_index_image(masks[index]), logits, masks[index])
         advance(index + 1)
     return scores, faults

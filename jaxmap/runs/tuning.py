@@ -38,7 +38,10 @@ from jaxmap.tuning.traverse_loss import (
 SOFT_START_M = 0.03
 """Where the width of the plane's threshold starts when the settings have a sharp one, which nothing can move."""
 
-_DATA = ("labels", "labels_are", "poses", "poses_world", "calibration", "start", "stop", "stride")
+_DATA = (
+    *("labels", "labels_are", "calibration", "baseline_unit", "start", "stop", "stride", "poses", "poses_world"),
+    *("pose_convention", "poses_are", "poses_unit", "poses_time_unit", "quaternion"),
+)
 """Settings that are of the data tuned on, and not of how they are mapped."""
 
 
@@ -57,7 +60,7 @@ def tuned_config(config: MapConfig, params: TunedParams) -> MapConfig:
     numbers = {name: _rounded(value) for name, value in params.labeller.items()}
     # Relief may stand beside another labeller, whose numbers then come first.
     for section in (config.labeller, "relief"):
-        options = getattr(config, section, None)
+        options: Any = getattr(config, section, None)
         own = {name: numbers.pop(name) for name in list(numbers) if hasattr(options, name)}
         if own:
             config = replace(config, **{section: replace(options, **own)})

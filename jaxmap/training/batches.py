@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float16, Int, UInt8
 
+from jaxmap.datasets.masks import MaskLookup
 from jaxmap.geometry.relief import RELIEF_CHANNELS, RELIEF_STRIDE
 from jaxmap.host.prefetch import prefetch
 from jaxmap.labels import IGNORE
 from jaxmap.training.data import Example, read_example
-from jaxmap.training.masks import MaskLookup
 from jaxmap.training.options import TrainingOptions
 from jaxmap.training.relief import read_relief
 from jaxmap.training.step import Batch

@@ -14,12 +14,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
-from jaxmap.datasets.images import IMAGE_SUFFIXES, image_size_px, read_image
-from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, stereo_paths
-from jaxmap.errors import JaxmapError
-from jaxmap.host.bounded_text import read_text
-from jaxmap.models.tensor_files import shortened
-from jaxmap.training.masks import (
+from jaxmap.datasets.images import IMAGE_SUFFIXES, image_rotation_tag, image_size_px, read_image, rotation_notes
+from jaxmap.datasets.masks import (
+    MASK_SUFFIXES,
     UNNAMED,
     MaskLookup,
     absent_classes,
@@ -28,9 +25,12 @@ from jaxmap.training.masks import (
     read_labels,
     unnamed_codes,
 )
+from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, stereo_paths
+from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import read_text
+from jaxmap.models.tensor_files import shortened
 from jaxmap.training.options import DataOptions
 
-MASK_SUFFIXES = (".png",)
 TRAIN_LIST, VALIDATION_LIST = "train.txt", "val.txt"
 MAX_THREADS = 8
 
@@ -49,7 +49,7 @@ class Example(NamedTuple):
         name: path of the image below `images/`, without suffix.
         image: the image file.
         mask: the mask file.
-        size_px: (height, width) of the image, from its header.
+        size_px: (height, width) of the image as viewers show it, from its header.
         stereo: folder of `disparity/NAME.png` and `cameras/NAME.json`; None where there are none or none are wanted.
     """
 
@@ -69,7 +69,7 @@ class TrainingSet(NamedTuple):
         train: training examples, in order of name.
         validation: validation examples; may be empty.
         lookup: from the pixels of the masks to labels.
-        notes: on the split, for the user.
+        notes: on the split and on rotation tags, for the user.
     """
 
     folder: Path
@@ -103,13 +103,15 @@ def open_training_set(
     split = split_names(folder, images, masks, validation_share=options.validation_share, seed=seed)
 
     def examples(names: Sequence[str]) -> tuple[Example, ...]:
-        sizes = _in_threads(lambda name: image_size_px(images[name][0]), names)
+        sizes = _in_threads(lambda name: image_size_px(images[name][0], as_shown=True), names)
         return tuple(
             Example(name, images[name][0], masks[name][0], (height, width))
             for name, (width, height) in zip(names, sizes, strict=True)
         )
 
-    return TrainingSet(folder, lookup.classes, examples(split.train), examples(split.validation), lookup, split.notes)
+    train, validation = examples(split.train), examples(split.validation)
+    notes = [*split.notes, *rotation_notes([example.image for example in (*train, *validation)])]
+    return TrainingSet(folder, lookup.classes, train, validation, lookup, tuple(notes))
 
 
 def with_stereo(training_set: TrainingSet) -> TrainingSet:
@@ -133,6 +135,13 @@ def with_stereo(training_set: TrainingSet) -> TrainingSet:
             where=folder,
             fix="put disparity/NAME.png and cameras/NAME.json beside images and masks, or leave out --network.relief",
         )
+    for example in (*result.train, *result.validation):
+        if example.stereo and image_rotation_tag(example.image) != 1:
+            raise JaxmapError(
+                "the image has a disparity and a rotation tag",
+                where=example.image,
+                fix="remove the tag: a disparity belongs to the pixels as they are stored",
+            )
     return result
 
 
@@ -151,7 +160,7 @@ def read_disparity(example: Example) -> tuple[Float32[np.ndarray, "H W"], LevelC
 def read_example(example: Example, lookup: MaskLookup) -> tuple[Pixels, Labels]:
     """Reads an image and its labels; grey images become RGB.
 
-    As everywhere, the rotation tag of a photograph is not applied: the mask lies on the stored pixels.
+    The rotation tag of a photograph is applied, as labelling programs do: the mask lies on what viewers show.
 
     Returns:
         image: uint8 (H, W, 3).
@@ -222,7 +231,7 @@ def digest(training_set: TrainingSet) -> str:
 
 
 def _read_rgb(example: Example) -> Pixels:
-    image = read_image(example.image)
+    image = read_image(example.image, as_shown=True)
     if image.shape[:2] != example.size_px:
         raise JaxmapError(
             f"the image is {image.shape[1]}x{image.shape[0]} px, and was {example.size_px[1]}x{example.size_px[0]} px",
@@ -235,11 +244,10 @@ def _read_rgb(example: Example) -> Pixels:
 def _check_size(pixels: np.ndarray, example: Example, kind: str, where: Path) -> None:
     if pixels.shape != example.size_px:
         (height, width), (rows, columns) = example.size_px, pixels.shape
-        raise JaxmapError(
-            f"the {kind} is {columns}x{rows} px, the image {width}x{height} px",
-            where=where,
-            fix=f"give each {kind} the size of its image",
-        )
+        fix = f"give each {kind} the size of its image"
+        if pixels.shape == (width, height) and (tag := image_rotation_tag(example.image)) > 4:
+            fix = f"the image's rotation tag {tag} turns it: turn the {kind}, too, or remove the tag"
+        raise JaxmapError(f"the {kind} is {columns}x{rows} px, the image {width}x{height} px", where=where, fix=fix)
 
 
 def _in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

@@ -9,13 +9,13 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxmap.datasets.masks import MaskLookup
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
 from jaxmap.labels import ANY_OTHER, IGNORE
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.deeplab import Weights, fold_batch_norm, pure_network
 from jaxmap.training.data import Example, read_example
-from jaxmap.training.masks import MaskLookup
 from jaxmap.training.relief import read_relief
 
 MAX_EXAMPLES = 6

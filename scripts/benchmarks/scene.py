@@ -15,7 +15,8 @@ import numpy as np
 from PIL import Image
 
 from jaxmap.datasets import open_sequence
-from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD, write_tum
+from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE
+from jaxmap.datasets.poses import write_tum
 from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M
 from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.types import GridSpec, StereoCamera, make_grid, make_stereo_camera
@@ -85,7 +86,7 @@ def resized_scene(width_px: int, height_px: int) -> Scene:
         width_px=width_px,
         height_px=height_px,
     )
-    T_world_camera = np.array(T_Z_UP_CAMERA_WORLD, np.float64)
+    T_world_camera = np.array(T_Z_UP_SOURCE["camera"], np.float64)
     T_world_camera[:3, 3] = (20.0, 12.0, 1.1)
     return Scene(left, right, camera, T_world_camera)
 

@@ -18,7 +18,8 @@ import numpy as np
 from common import CELL_M, RANGE_M, Frames, Table, Traverse, command_line, jaxmap, parse
 from PIL import Image
 
-from jaxmap.datasets.images import as_rgb, read_index_image
+from jaxmap.datasets.images import as_rgb
+from jaxmap.datasets.masks import read_values
 from jaxmap.labellers.options import DeeplabOptions
 from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.runs.mapping_plan import Plan
@@ -71,7 +72,7 @@ def write_masks(folder: Path, plan: Plan, parts: dict[str, list[PreparedFrame]],
     for part, listed in (("learnt from", "train.txt"), ("held out", "val.txt")):
         for prepared in parts[part]:
             assert prepared.rectified is not None
-            mask = plan.front_end.rectify_labels(read_index_image(labels / f"{prepared.ref.name}.png"))
+            mask = plan.front_end.rectify_labels(read_values(labels / f"{prepared.ref.name}.png").astype(np.uint8))
             Image.fromarray(as_rgb(prepared.rectified.left)).save(folder / "images" / f"{prepared.ref.name}.png")
             Image.fromarray(mask).save(folder / "masks" / f"{prepared.ref.name}.png")
         (folder / listed).write_text("".join(f"{prepared.ref.name}\n" for prepared in parts[part]))

@@ -18,7 +18,8 @@ import jax
 import numpy as np
 from common import SHARED, Table, command_line, parse
 
-from jaxmap.datasets.images import as_rgb, read_image, read_index_image
+from jaxmap.datasets.images import as_rgb, read_image
+from jaxmap.datasets.masks import read_values
 from jaxmap.geometry.options import DepthOptions
 from jaxmap.host.files import bundled
 from jaxmap.labellers.options import ReliefOptions
@@ -77,7 +78,7 @@ def photographs(model: Path) -> None:
     found, false, missed = 0, 0, 0
     for name in (MARS / "val.txt").read_text().split():
         image = as_rgb(read_image(next((MARS / "images").glob(f"{Path(name).stem}.*"))))
-        truth = read_index_image(MARS / "masks" / f"{Path(name).stem}.png") > 127
+        truth = read_values(MARS / "masks" / f"{Path(name).stem}.png") > 127
         called = np.asarray(apply(network.weights, image[None]))[0].argmax(axis=-1) == ROCK
         found, false = found + (called & truth).sum(), false + (called & ~truth).sum()
         missed += (~called & truth).sum()

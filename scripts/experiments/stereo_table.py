@@ -28,7 +28,7 @@ import numpy as np
 from common import SHARED, Frames, Scored, Table, Traverse, command_line, fuse, parse
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.images import read_index_image
+from jaxmap.datasets.masks import read_values
 from jaxmap.datasets.samples import motorcycle_disparity
 from jaxmap.evaluation.geometry_scores import depth_consistency
 from jaxmap.mapping.sequence import PreparedFrame
@@ -153,7 +153,7 @@ class Simulated(Site):
     def _truths(self) -> dict[int, Truth]:
         found = {}
         for index, frame in enumerate(self.sequence.frames):
-            labels = read_index_image(self.traverse.gt / "labels" / f"{frame.name}.png")
+            labels = read_values(self.traverse.gt / "labels" / f"{frame.name}.png").astype(np.uint8)
             depth = self.traverse.gt / "depth" / f"{frame.name}.npy"
             true_px = self._disparity_px(np.load(depth)) if depth.exists() else None
             found[index] = Truth(true_px, self.front_end.rectify_labels(labels))

@@ -10,7 +10,7 @@ import scenes
 from bags import FRAMES, KINDS, Messages, Sent, bag, camera_poses, images, time_ns, whole_bag
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.bag_files import Topic, is_bag
+from jaxmap.datasets.bag_files import Bag, Topic, is_bag
 from jaxmap.datasets.bag_topics import choose_pair, is_rectified_name
 from jaxmap.datasets.options import BagOptions
 from jaxmap.errors import FrameError, JaxmapError
@@ -44,6 +44,12 @@ def test_a_truncated_bag_is_told(tmp_path, kind, share):
 def test_a_file_that_only_has_the_name_of_a_bag_is_told(tmp_path, name):
     (tmp_path / name).write_bytes(b"no bag at all, but long enough to be read" * 9)
     assert "the bag cannot be read" in refused(tmp_path / name)
+
+
+def test_topics_that_are_only_announced_are_told(tmp_path, monkeypatch):
+    path = whole_bag(tmp_path)
+    monkeypatch.setattr(Bag, "messages", lambda bag, topics: iter(()))
+    assert "no message of /stereo/left/image_rect can be found" in refused(path)
 
 
 def test_an_image_whose_bytes_are_damaged_is_one_lost_frame(tmp_path):

@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from jaxmap.datasets import ReadOptions, open_sequence
-from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD, write_tum
+from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE
+from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.stereo.rectify import StereoRig, make_rectifier
 
@@ -67,7 +68,7 @@ def test_a_recording_opens_with_poses_of_its_left_camera(tmp_path):
     assert isinstance(sequence.camera, StereoRig)
     np.testing.assert_allclose(sequence.camera.t_right_left_m, [-0.11, 0, 0], atol=1e-12)
     np.testing.assert_allclose(sequence.T_world_camera[:, :3, 3], [[i + 0.1, 0.2, 0.3] for i in range(4)])
-    np.testing.assert_array_equal(sequence.T_world_camera[0, :3, :3], T_Z_UP_CAMERA_WORLD[:3, :3])
+    np.testing.assert_array_equal(sequence.T_world_camera[0, :3, :3], T_Z_UP_SOURCE["camera"][:3, :3])
     assert sequence.frames[0].name == str(START_NS)
     assert sequence.frames[0].timestamp_s == START_NS / 1e9
     assert sequence.frames[0].right.name == f"{START_NS + 1_000_000}.png"
@@ -77,9 +78,9 @@ def test_a_recording_opens_with_poses_of_its_left_camera(tmp_path):
 def test_given_camera_poses_are_taken_as_they_are_and_given_body_poses_are_moved(tmp_path):
     folder = made_recording(tmp_path, ground_truth=False)
     times_s = np.array([(START_NS + i * STEP_NS) / 1e9 for i in range(4)])
-    write_tum(tmp_path / "camera.tum", times_s, np.tile(T_Z_UP_CAMERA_WORLD, (4, 1, 1)))
+    write_tum(tmp_path / "camera.tum", times_s, np.tile(T_Z_UP_SOURCE["camera"], (4, 1, 1)))
     sequence = open_sequence(folder, ReadOptions(poses=tmp_path / "camera.tum"))
-    np.testing.assert_allclose(sequence.T_world_camera, np.tile(T_Z_UP_CAMERA_WORLD, (4, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(sequence.T_world_camera, np.tile(T_Z_UP_SOURCE["camera"], (4, 1, 1)), atol=1e-12)
     (tmp_path / "body.csv").write_text(f"{START_NS},5,0,0,1,0,0,0\n")
     sequence = open_sequence(folder, ReadOptions(poses=tmp_path / "body.csv"))
     np.testing.assert_allclose(sequence.T_world_camera[:, :3, 3], [[5.1, 0.2, 0.3]])
@@ -158,7 +159,7 @@ def test_the_real_recording_needs_poses_and_rectifies_with_them(tmp_path):
     assert "give them with --poses FILE" in refused(folder)
     names = sorted(file.stem for file in (folder / "mav0" / "cam0" / "data").iterdir())
     times_s = np.array([int(name) / 1e9 for name in names])
-    write_tum(tmp_path / "made.tum", times_s, np.tile(T_Z_UP_CAMERA_WORLD, (12, 1, 1)))
+    write_tum(tmp_path / "made.tum", times_s, np.tile(T_Z_UP_SOURCE["camera"], (12, 1, 1)))
     sequence = open_sequence(folder, ReadOptions(poses=tmp_path / "made.tum"))
     assert [frame.name for frame in sequence.frames] == names
     camera = make_rectifier(sequence.camera).camera

@@ -2,11 +2,12 @@
 
 import io
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageOps
 
 from jaxmap.datasets.base import FrameRef, read_stereo_pair
 from jaxmap.datasets.images import first_image_size_px, image_size_px, list_images, read_image
@@ -52,17 +53,65 @@ def test_deep_grey_is_shifted_from_the_bits_it_uses(tmp_path, bits):
     np.testing.assert_array_equal(image, deep >> (bits - 8))
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif", "ppm"])
+def test_deep_colours_are_shifted_as_deep_grey_is(tmp_path, suffix):
+    """Pillow alone would cut them to their upper 8 bits, of which 12-bit images use 4."""
+    deep = RNG.integers(0, 4096, (6, 9, 3)).astype(np.uint16)
+    path = tmp_path / f"c.{suffix}"
+    cv2.imwrite(str(path), deep[..., ::-1])
+    np.testing.assert_array_equal(read_image(path), deep >> 4)
+    np.testing.assert_array_equal(read_image(path, bits=14), deep >> 6)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(FrameError, match="the image cannot be read"):
+        read_image(path)
+
+
+def test_a_deep_pgm_keeps_its_numbers_whatever_its_greatest(tmp_path):
+    deep = np.linspace(0, 4095, 54).astype(">u2").reshape(6, 9)
+    (tmp_path / "d.pgm").write_bytes(b"P5 9 6 4095\n" + deep.tobytes())
+    np.testing.assert_array_equal(read_image(tmp_path / "d.pgm", bits=12), deep >> 4)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_a_rotation_tag_is_applied_on_request_only(tmp_path, suffix, tag):
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    stored = np.kron(GREY, np.ones((8, 8), np.uint8))
+    path, plain = tmp_path / f"t.{suffix}", tmp_path / f"p.{suffix}"
+    Image.fromarray(stored).save(path, exif=exif)
+    Image.fromarray(stored).save(plain)
+    np.testing.assert_array_equal(read_image(path), read_image(plain))
+    assert image_size_px(path) == stored.shape[::-1]
+    with Image.open(plain) as image:
+        image.getexif()[0x0112] = tag
+        shown = np.array(ImageOps.exif_transpose(image))
+    np.testing.assert_array_equal(read_image(path, as_shown=True), shown)
+    assert image_size_px(path, as_shown=True) == shown.shape[::-1]
+
+
 def test_both_sides_of_a_deep_pair_are_shifted_alike(tmp_path):
-    left = saved(tmp_path / "l.png", np.full((4, 4), 1000, np.uint16))
-    right = saved(tmp_path / "r.png", np.full((4, 4), 4000, np.uint16))
+    ramp = np.linspace(0, 1000, 16).astype(np.uint16).reshape(4, 4)
+    left, right = saved(tmp_path / "l.png", ramp), saved(tmp_path / "r.png", ramp * 4)
     pair = read_stereo_pair(frame_of(left, right))
-    assert (pair.left[0, 0], pair.right[0, 0]) == (1000 >> 4, 4000 >> 4)
+    np.testing.assert_array_equal(pair.left, ramp >> 4)
+    np.testing.assert_array_equal(pair.right, ramp >> 2)
+    given = read_stereo_pair(frame_of(left, right), bits=16)
+    np.testing.assert_array_equal(given.right, ramp >> 6)
 
 
 def test_a_pair_of_grey_and_rgb_becomes_grey(tmp_path):
     pair = read_stereo_pair(frame_of(saved(tmp_path / "l.png", RGB), saved(tmp_path / "r.png", GREY)))
     assert pair.left.shape == pair.right.shape == (6, 9)
     np.testing.assert_allclose(pair.left, RGB @ [0.299, 0.587, 0.114], atol=1)
+
+
+def test_an_image_of_another_size_than_the_calibration_is_refused_before_it_is_decoded(tmp_path):
+    left = saved(tmp_path / "l.png", GREY)
+    right = saved(tmp_path / "r.png", np.zeros((600, 900), np.uint8))
+    right.write_bytes(right.read_bytes()[:60])
+    with pytest.raises(FrameError, match=r"the image is 900x600 px, the calibration is for 9x6 px in .*r\.png"):
+        read_stereo_pair(frame_of(left, right), size_px=(9, 6))
 
 
 def test_sizes_that_differ_are_refused(tmp_path):
@@ -79,7 +128,7 @@ def test_missing_and_foreign_files_are_refused(tmp_path):
     (tmp_path / "text.png").write_text("hello")
     (tmp_path / "empty.png").write_bytes(b"")
     for name in ("text.png", "empty.png"):
-        with pytest.raises(FrameError, match=r"not an image of a known format in .*; replace the file"):
+        with pytest.raises(FrameError, match=r"not an image of a known format in .*; give PNG, JPEG"):
             read_image(tmp_path / name)
     with pytest.raises(FrameError, match="cannot be read"):
         read_image(tmp_path)
@@ -97,7 +146,7 @@ def test_truncated_files_are_refused(tmp_path, suffix, share):
     path = saved(tmp_path / f"whole{suffix}", RNG.integers(0, 256, (64, 64, 3), np.uint8))
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(FrameError, match=r"the image cannot be read \(.*\) in .*; replace the file"):
+    with pytest.raises(FrameError, match=r"the image cannot be read \(.*\) in .*; replace it by a whole one"):
         read_image(path)
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.datasets.poses import write_tum
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import JaxmapError, UsageError
 
 REALDATA = Path(os.environ.get("JAXMAP_REALDATA", Path(__file__).parents[2] / ".." / "shared" / "realdata"))
 needs_realdata = pytest.mark.skipif(not REALDATA.is_dir(), reason="the folder of real data is absent")
@@ -66,6 +66,30 @@ def test_the_colour_pair_is_taken_without_the_grey_one_and_its_poses_are_moved(t
     write_tum(tmp_path / "left.tum", np.arange(4) / 10, np.tile(np.eye(4), (4, 1, 1)))
     given = open_sequence(tmp_path / "sequences" / "07", ReadOptions(poses=tmp_path / "left.tum"))
     np.testing.assert_array_equal(given.T_world_camera[0, :3, 3], [0, 0, 0])
+
+
+def test_with_both_pairs_the_grey_one_is_taken_and_told_and_the_other_can_be_chosen(tmp_path):
+    folder = made_sequence(tmp_path, cameras=(0, 1, 2, 3))
+    grey = open_sequence(folder)
+    assert grey.frames[0].left.parts[-2] == "image_0"
+    assert any("the grey pair is taken" in note and "--camera color" in note for note in grey.notes)
+    chosen = open_sequence(folder, ReadOptions(camera="grey"))
+    assert not any("pair" in note for note in chosen.notes)
+    np.testing.assert_array_equal(chosen.T_world_camera, grey.T_world_camera)
+    colour = open_sequence(folder, ReadOptions(camera="color"))
+    assert [path.parts[-2] for path in (colour.frames[0].left, colour.frames[0].right)] == ["image_2", "image_3"]
+    # Camera 2 sits 0.1 m to the left of camera 0.
+    np.testing.assert_allclose(
+        colour.T_world_camera[:, :3, 3] - grey.T_world_camera[:, :3, 3], np.tile([-0.1, 0, 0], (4, 1)), atol=1e-12
+    )
+    with pytest.raises(UsageError, match=r"kitti has no camera 'pancam' in --camera; choose grey or color"):
+        open_sequence(folder, ReadOptions(camera="pancam"))
+
+
+def test_half_a_pair_is_not_taken_where_the_other_is_whole(tmp_path):
+    folder = made_sequence(tmp_path, cameras=(0, 2, 3))
+    assert open_sequence(folder).frames[0].left.parts[-2] == "image_2"
+    assert "the pair of image_0 has no image_1 in SEQ; restore it" in refused(folder, ReadOptions(camera="grey"))
 
 
 def test_a_relative_path_finds_the_poses(tmp_path, monkeypatch):

@@ -9,7 +9,8 @@ from PIL import Image
 
 from jaxmap.datasets import READERS, Reader, ReadOptions, open_sequence, register
 from jaxmap.datasets.base import FrameRef, assemble, read_stereo_pair
-from jaxmap.datasets.poses import T_Z_UP_CAMERA_WORLD, make_pose_track, write_tum
+from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE
+from jaxmap.datasets.poses import make_pose_track, write_tum
 from jaxmap.datasets.samples import motorcycle_disparity
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.types import make_stereo_camera
@@ -19,7 +20,7 @@ CAMERA = {"image_size_px": [9, 6], "fx_px": 8.0, "cx_px": 4, "cy_px": 2.5, "base
 
 def track_of(count: int, start_m=(0.0, 0.0, 0.0)) -> np.ndarray:
     """Level cameras that look north (+y) and move along it by 1 m each."""
-    T = np.tile(T_Z_UP_CAMERA_WORLD, (count, 1, 1))
+    T = np.tile(T_Z_UP_SOURCE["camera"], (count, 1, 1))
     T[:, :3, 3] = np.asarray(start_m) + np.arange(count)[:, None] * [0.0, 1.0, 0.0]
     return T
 
@@ -114,7 +115,7 @@ def test_poses_in_a_camera_world_are_turned_and_noted(tmp_path):
     write_tum(given, np.arange(5.0) / 10, T)
     sequence = open_sequence(folder, ReadOptions(poses=given))
     np.testing.assert_array_equal(sequence.T_world_camera, track_of(5))
-    np.testing.assert_array_equal(sequence.T_world_source, T_Z_UP_CAMERA_WORLD)
+    np.testing.assert_array_equal(sequence.T_world_source, T_Z_UP_SOURCE["camera"])
     assert "the poses' world is taken for camera-like (y down) and turned z-up" in sequence.notes
     kept = open_sequence(folder, ReadOptions(poses=given, poses_world="z_up"))
     np.testing.assert_array_equal(kept.T_world_camera, T)
@@ -129,7 +130,7 @@ def test_missing_poses_and_poses_of_a_body_are_reported(tmp_path):
     )
     csv = tmp_path / "data.csv"
     csv.write_text("0,0,0,0,1,0,0,0\n")
-    assert "EuRoC csv holds poses of the body, not of the camera" in refused(folder, ReadOptions(poses=csv))
+    assert "a csv of EuRoC's form holds poses of the body, not" in refused(folder, ReadOptions(poses=csv))
 
 
 def test_missing_calibration_is_reported(tmp_path):
@@ -214,7 +215,7 @@ def test_counts_and_orders_that_disagree_are_reported(tmp_path):
 def test_an_offset_takes_poses_of_a_body_to_the_camera(tmp_path):
     folder = plain_folder(tmp_path)
     sequence = open_sequence(folder)
-    T_body_camera = T_Z_UP_CAMERA_WORLD.copy()
+    T_body_camera = T_Z_UP_SOURCE["camera"].copy()
     T_body_camera[:3, 3] = [0.1, 0.2, 0.3]
     T_world_body = np.tile(np.eye(4), (5, 1, 1))
     T_world_body[:, 0, 3] = np.arange(5.0)
@@ -229,17 +230,17 @@ def test_an_offset_takes_poses_of_a_body_to_the_camera(tmp_path):
         T_child_camera=T_body_camera,
     )
     np.testing.assert_allclose(offset.T_world_camera[2, :3, 3], [2.1, 0.2, 0.3])
-    np.testing.assert_array_equal(offset.T_world_camera[2, :3, :3], T_Z_UP_CAMERA_WORLD[:3, :3])
+    np.testing.assert_array_equal(offset.T_world_camera[2, :3, :3], T_Z_UP_SOURCE["camera"][:3, :3])
 
 
 def test_unknown_sources_are_refused_with_the_known_formats(tmp_path):
     assert refused(tmp_path / "none").startswith("there is no folder SOURCE; give the folder of one sequence")
     (tmp_path / "file").write_text("")
-    assert refused(tmp_path / "file").startswith("SOURCE is a file; give the folder of one sequence")
+    assert refused(tmp_path / "file").startswith("SOURCE is a file, but no bag; give the folder of one sequence")
     (tmp_path / "empty").mkdir()
     message = refused(tmp_path / "empty")
-    assert message.startswith("no data set is recognised in SOURCE; looked for kitti: KITTI odometry")
-    assert all(f"{reader.name}: {reader.help}" in message for reader in READERS.values())
+    assert message.startswith("no data set is recognised: looked for what marks kitti, euroc, ")
+    assert all(name in message for name in READERS) and "jaxmap info says what each must hold" in message
 
 
 def test_a_folder_that_two_readers_fit_needs_a_choice(tmp_path):
@@ -294,7 +295,7 @@ def test_the_motorcycle_opens():
     sequence = open_sequence("sample:motorcycle")
     assert (sequence.name, sequence.dataset, len(sequence.frames)) == ("motorcycle", "sample", 1)
     assert sequence.frames[0].timestamp_s == 0.0
-    np.testing.assert_array_equal(sequence.T_world_camera, T_Z_UP_CAMERA_WORLD[None])
+    np.testing.assert_array_equal(sequence.T_world_camera, T_Z_UP_SOURCE["camera"][None])
     pair = sequence.read_pair(sequence.frames[0])
     assert pair.left.shape == pair.right.shape == (500, 741, 3)
     camera = sequence.camera

@@ -17,11 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence, rosbag
 from jaxmap.datasets.bag_files import Bag
-from jaxmap.datasets.bag_frames import T_LINK_OPTICAL, make_track
+from jaxmap.datasets.bag_frames import T_LINK_OPTICAL
 from jaxmap.datasets.bag_images import decode_image
 from jaxmap.datasets.bag_log import read_log
 from jaxmap.datasets.crs import to_utm
 from jaxmap.datasets.options import BagOptions
+from jaxmap.datasets.poses import write_tum
+from jaxmap.datasets.stamped_poses import make_track
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
@@ -51,27 +53,63 @@ def test_a_bag_gives_what_the_folder_gives(tmp_path, kind):
         assert_same(open_sequence(path), expected)
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_raw_images_come_with_the_rig_of_their_camera_infos(tmp_path, kind):
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_bag_gives_what_the_bundled_traverse_gives(tmp_path, compressed):
+    """Raw colour images, a camera askew and poses in UTM; the rotation between the cameras goes through R and P."""
+    whole = open_sequence("sample:traverse")
+    T = whole.T_world_camera[:2].copy()
+    T[:, :3, 3] += whole.site_origin
+    write_tum(tmp_path / "poses.tum", np.array([frame.timestamp_s for frame in whole.frames[:2]]), T)
+    expected = open_sequence("sample:traverse", ReadOptions(poses=tmp_path / "poses.tum"))
+    messages, rig = Messages("mcap"), expected.camera
+    assert isinstance(rig, StereoRig)
+    sent = rig_infos(messages, rig)
+    for frame, pose in zip(expected.frames, T, strict=True):
+        at_ns = round(frame.timestamp_s * 1e9)
+        for side, path, pixels in zip("lr", (frame.left, frame.right), expected.read_pair(frame), strict=True):
+            image = messages.image(at_ns, pixels, "rgb8")
+            jpeg = messages.compressed(at_ns, path.read_bytes(), "rgb8; jpeg compressed bgr8")
+            sent.append(
+                Sent(f"/{side}/image_raw{'/compressed' if compressed else ''}", at_ns, jpeg if compressed else image)
+            )
+        sent.append(Sent("/pose", at_ns, messages.pose_stamped(at_ns, pose)))
+    found = open_sequence(bag(tmp_path, "mcap", sent))
+    np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
+    np.testing.assert_array_equal(found.site_origin, expected.site_origin)
+    assert_rig(found, rig)
+    for frame, other in zip(found.frames, expected.frames, strict=True):
+        for image, true_image in zip(found.read_pair(frame), expected.read_pair(other), strict=True):
+            np.testing.assert_array_equal(image, true_image)
+
+
+def rig_infos(messages: Messages, rig: StereoRig) -> list[Sent]:
     """R and P are those of OpenCV's rectification, as ROS's calibrator writes them."""
-    messages = Messages(kind)
-    rig, size = RIG, (RIG.width_px, RIG.height_px)
-    t = rig.t_right_left_m.reshape(3, 1)
+    size, t = (rig.width_px, rig.height_px), rig.t_right_left_m.reshape(3, 1)
     R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
         rig.K_left, rig.distortion_left, rig.K_right, rig.distortion_right, size, rig.R_right_left, t
     )
     left = messages.info(size, rig.K_left, rig.distortion_left, R_left, P_left)
     right = messages.info(size, rig.K_right, rig.distortion_right, R_right, P_right)
-    sent = [*camera_poses(messages), Sent("/l/camera_info", 0, left), Sent("/r/camera_info", 0, right)]
-    picture = messages.image(time_ns(0), np.zeros(size[::-1], np.uint8), "mono8")
-    sent += [Sent(f"/{side}/image_raw", time_ns(0), picture) for side in "lr"]
-    sequence = open_sequence(bag(tmp_path, kind, sent))
+    return [Sent("/l/camera_info", 0, left), Sent("/r/camera_info", 0, right)]
+
+
+def assert_rig(sequence: StereoSequence, rig: StereoRig) -> None:
     found = sequence.camera
     assert isinstance(found, StereoRig)
-    np.testing.assert_array_equal(found.K_left, rig.K_left)
-    np.testing.assert_array_equal(found.distortion_right, rig.distortion_right)
+    for name in ("K_left", "K_right", "distortion_left", "distortion_right"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(rig, name))
     np.testing.assert_allclose(found.R_right_left, rig.R_right_left, atol=1e-12)
-    np.testing.assert_allclose(found.t_right_left_m, rig.t_right_left_m.ravel(), atol=1e-12)
+    np.testing.assert_allclose(found.t_right_left_m, rig.t_right_left_m, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_raw_images_come_with_the_rig_of_their_camera_infos(tmp_path, kind):
+    messages = Messages(kind)
+    picture = messages.image(time_ns(0), np.zeros((RIG.height_px, RIG.width_px), np.uint8), "mono8")
+    sent = [*camera_poses(messages), *rig_infos(messages, RIG)]
+    sent += [Sent(f"/{side}/image_raw", time_ns(0), picture) for side in "lr"]
+    sequence = open_sequence(bag(tmp_path, kind, sent))
+    assert_rig(sequence, RIG)
     assert "images are taken for raw, by the topic's name" in sequence.notes
 
 
@@ -200,6 +238,19 @@ def test_poses_of_the_body_come_to_the_camera_by_tf(tmp_path, kind):
     sequence = open_sequence(bag(bare, kind, images(messages) + odometry))
     np.testing.assert_allclose(sequence.T_world_camera[:, :3, :3], truth[:, :3, :3], atol=1e-9)
     assert "tf does not say where the camera is" in " ".join(sequence.notes)
+
+
+def test_conventions_that_are_asked_for_are_those_of_the_messages(tmp_path):
+    messages = Messages("ros1")
+    truth = np.stack([scenes.pose(index) for index in range(FRAMES)])
+    sent = images(messages)
+    for index, T in enumerate(truth @ T_LINK_OPTICAL.T):
+        T[:3, 3] *= 1000
+        sent.append(Sent("/odom", time_ns(index), messages.odometry(time_ns(index), T, "cam_optical")))
+    options = ReadOptions(pose_convention="body", poses_unit="mm")
+    sequence = open_sequence(bag(tmp_path, "ros1", sent), options)
+    np.testing.assert_allclose(sequence.T_world_camera, truth, atol=1e-9)
+    assert "body axes at the camera's place, as asked" in sequence.notes
 
 
 def test_a_camera_that_turns_on_the_body_is_followed(tmp_path):

@@ -59,6 +59,21 @@ def test_a_palette_image_holds_indices(tmp_path):
     np.testing.assert_array_equal(LabelFolder(tmp_path, False, 3, "raw").read(REF, PLAIN)["labels"], truth())
 
 
+@pytest.mark.parametrize("name", ["f000.PNG", "f000.tif", "f000.bmp", "deep", "grey as RGB", "two levels"])
+def test_indices_may_be_stored_in_other_ways(tmp_path, name):
+    labels = truth() if name != "two levels" else np.minimum(truth(), 1)
+    pictures = {
+        "deep": Image.fromarray(labels.astype(np.uint16)),
+        "grey as RGB": Image.fromarray(np.stack([labels] * 3, axis=-1)),
+        "two levels": Image.fromarray(labels == 1),
+    }
+    pictures.get(name, Image.fromarray(labels)).save(tmp_path / (name if "." in name else "f000.png"))
+    opened = open_label_folder(tmp_path, 3, "raw", "f000")
+    fields = opened.read(REF, PLAIN)
+    assert fields["labels"].dtype == np.uint8
+    np.testing.assert_array_equal(fields["labels"], labels)
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_probabilities_come_as_float32(tmp_path, dtype):
     fields = read_soft(tmp_path, one_hot().astype(dtype) * dtype(0.5))
@@ -109,8 +124,8 @@ def test_nothing_is_unpickled(tmp_path):
     [
         (np.full((HEIGHT_PX, WIDTH_PX), 3, np.uint8), "label 3, but there are 3 classes"),
         (np.zeros((60, 80), np.uint8), "the labels are 80x60 px"),
-        (np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8), "type RGB"),
-        (np.zeros((HEIGHT_PX, WIDTH_PX), np.uint16), "type I"),
+        (np.full((HEIGHT_PX, WIDTH_PX, 3), (0, 1, 2), np.uint8), "the mask is in colour"),
+        (np.full((HEIGHT_PX, WIDTH_PX), 256, np.uint16), "label 256, but there are 3 classes"),
     ],
 )
 def test_faulty_indices_are_refused(tmp_path, labels, named):

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from jaxmap.datasets.masks import UNNAMED, make_mask_lookup, meaning, read_labels
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.labels import IGNORE
 from jaxmap.training.data import check_training_set, digest, open_training_set, read_example, split_names
-from jaxmap.training.masks import UNNAMED, make_mask_lookup, meaning, read_labels
 from jaxmap.training.options import DataOptions
 
 CLASSES = ("sand", "rock")
@@ -242,12 +242,37 @@ def test_examples_are_rgb_and_labels(folder) -> None:
     assert labels.dtype == np.uint8 and set(np.unique(labels)) == {0, 1, IGNORE}
 
 
-def test_a_turned_photograph_stays_as_stored(folder) -> None:
+@pytest.mark.parametrize(("tag", "turn"), [(3, Image.Transpose.ROTATE_180), (6, Image.Transpose.ROTATE_90)])
+def test_a_photograph_is_taken_as_viewers_show_it(folder, tag, turn) -> None:
+    """The mask is drawn on the upright picture, whose upper rows are bright."""
     exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (20, 12), (1, 2, 3)).save(folder / "images/a.jpg", exif=exif)
+    exif[0x0112] = tag
+    upright = np.zeros((12, 20, 3), np.uint8)
+    upright[:4] = 200
+    Image.fromarray(upright).transpose(turn).save(folder / "images/a.jpg", exif=exif, quality=95)
     opened = open_training_set(folder, CLASSES, DataOptions(validation_share=0))
-    assert read_example(opened.train[0], opened.lookup)[0].shape == (12, 20, 3)
+    assert opened.train[0].size_px == (12, 20)
+    image, labels = read_example(opened.train[0], opened.lookup)
+    assert image.shape == (12, 20, 3) and (image[labels == 1] > 100).mean() > 0.9
+    assert opened.notes[1].startswith("1 of 5 images carry a rotation tag (a.jpg) and are turned")
+
+
+def test_a_mask_on_the_stored_pixels_of_a_turned_photograph_is_refused(folder) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 8
+    Image.new("RGB", (20, 12), (1, 2, 3)).save(folder / "images/a.jpg", exif=exif)
+    assert error_of(folder) == (
+        "the mask is 20x12 px, the image 12x20 px in SET/masks/a.png; the image's rotation tag 8 turns it: "
+        "turn the mask, too, or remove the tag"
+    )
+
+
+@pytest.mark.parametrize("suffix", ["PNG", "tif", "bmp"])
+def test_masks_may_have_other_suffixes(folder, suffix) -> None:
+    with Image.open(folder / "masks/a.png") as mask:
+        mask.save(folder / f"masks/a.{suffix}")
+    (folder / "masks/a.png").unlink()
+    assert check_training_set(open_training_set(folder, CLASSES)).sum() > 0
 
 
 def test_the_check_counts_every_pixel_once(folder) -> None:
@@ -334,7 +359,7 @@ def test_missing_and_empty_folders(folder, tmp_path) -> None:
     (folder / "masks/.hidden").mkdir(parents=True)
     write_mask(folder / "masks/.hidden/a.png", np.zeros((3, 3), np.uint8))
     write_mask(folder / "masks/._a.png", np.zeros((3, 3), np.uint8))
-    assert error_of(folder) == "no .png file in SET/masks; put files there (.png)"
+    assert error_of(folder) == "no .png file in SET/masks; put files there (.png .tif .tiff .bmp)"
 
 
 def truncate(path: Path) -> None:
@@ -372,20 +397,36 @@ FAULTY_FILES = [
         big,
         "the mask is 20x13 px, the image 20x12 px in SET/masks/a.png; give each mask the size of its image",
     ),
-    ("masks/a.png", junk, "not an image of a known format in SET/masks/a.png; replace the mask"),
-    ("masks/a.png", empty, "not an image of a known format in SET/masks/a.png; replace the mask"),
-    ("masks/a.png", truncate, "the mask cannot be read (.*) in SET/masks/a.png; replace the file"),
+    (
+        "masks/a.png",
+        junk,
+        "not an image of a known format in SET/masks/a.png; give PNG, JPEG, TIFF, BMP, PGM, PPM or WebP",
+    ),
+    (
+        "masks/a.png",
+        empty,
+        "not an image of a known format in SET/masks/a.png; give PNG, JPEG, TIFF, BMP, PGM, PPM or WebP",
+    ),
+    (
+        "masks/a.png",
+        truncate,
+        "the mask cannot be read (.*) in SET/masks/a.png; replace it by a whole one of 8 or 16 bits",
+    ),
     (
         "masks/a.png",
         coloured,
         "the mask is in colour in SET/masks/a.png; say which colour is which class: --data.palette CLASS '#rrggbb' ...",
     ),
     ("masks/a.png", deep, "the mask holds no values of 8 or 16 bits in SET/masks/a.png; write it as 8-bit grey"),
-    ("images/a.jpg", junk, "not an image of a known format in SET/images/a.jpg; replace the file"),
+    (
+        "images/a.jpg",
+        junk,
+        "not an image of a known format in SET/images/a.jpg; give PNG, JPEG, TIFF, BMP, PGM, PPM or WebP",
+    ),
     (
         "images/a.jpg",
         truncate,
-        "the image cannot be read (.*) in SET/images/a.jpg; replace the file by a whole 8-bit image",
+        "the image cannot be read (.*) in SET/images/a.jpg; replace it by a whole one of 8 or 16 bits",
     ),
     (
         "masks/a.png",

@@ -241,7 +241,7 @@ def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, tr
     assert {"sigma_m", "threshold_m"} <= told["before"].keys()
 
 
-@pytest.mark.parametrize("labeller, own", [("deeplab", {"temperature": 2.0}), ("files", {}), ("relief", {})])
+@pytest.mark.parametrize(("labeller", "own"), [("deeplab", {"temperature": 2.0}), ("files", {}), ("relief", {})])
 def test_tuned_numbers_go_to_the_options_they_are_of(labeller, own):
     """Relief beside another labeller has numbers of its own, and so may the other have."""
     fusion = make_fusion_params(("sand", "rock"))

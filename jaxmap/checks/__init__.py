@@ -1,0 +1,1 @@
+"""What a sequence says compared with what its images show, before anything is mapped."""
