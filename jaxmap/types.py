@@ -100,6 +100,22 @@ def make_stereo_camera(
     return StereoCamera(**leaves, width_px=int(width_px), height_px=int(height_px))
 
 
+class Pinhole(NamedTuple):
+    """The numbers of a rectified stereo camera in float64, for the host."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    doffs_px: float
+
+
+def pinhole(camera: StereoCamera) -> Pinhole:
+    """The numbers of a camera."""
+    return Pinhole(*(float(getattr(camera, name)) for name in Pinhole._fields))
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Frame:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -124,6 +124,19 @@ class Console:
         with Progress(*columns, TextColumn("{task.fields[note]}"), console=self._rich, transient=True) as bar:
             task = bar.add_task(title, total=total, note="")
             yield lambda done, note="": bar.update(task, completed=done, note=note)
+
+    @contextmanager
+    def counted(self, title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+        """Shows progress once there is some; yields a function to call with the number done, and of all."""
+        with ExitStack() as stack:
+            shown: list[Advance] = []
+
+            def count(done: int, total: int) -> None:
+                if not shown:
+                    shown.append(stack.enter_context(self.steps(title, unit, total)))
+                shown[0](done)
+
+            yield count
 
     def _plain_steps(self, title: str, unit: str, total: int) -> Advance:
         printed_s = time.monotonic()

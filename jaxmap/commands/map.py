@@ -67,7 +67,8 @@ def main(words: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     folder = RunFolder(arguments.out)
-    plan = plan_run(arguments.sequence, config, console.notify)
+    with console.counted("odometry", "frames") as on_frame:
+        plan = plan_run(arguments.sequence, config, console.notify, on_frame)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite
     with (

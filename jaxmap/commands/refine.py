@@ -72,7 +72,7 @@ class RefineArguments:
     dataset: str = "auto"
     """The reader, see jaxmap map --help."""
     poses: Path | None = None
-    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
+    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
     poses_world: PosesWorld = "auto"
     """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
     pose_convention: PoseConvention = "auto"

@@ -31,6 +31,7 @@ from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE, PoseReading, stand_upright,
 from jaxmap.datasets.poses import (
     PoseTrack,
     in_unit_of_frames,
+    make_pose_track,
     poses_at,
     read_poses,
     split_site_origin,
@@ -41,6 +42,9 @@ from jaxmap.datasets.units import METRES, with_baseline_unit
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
+
+OnFrame = Callable[[int, int], None]
+"""Called with the number of frames done, and of all."""
 
 
 class StereoPair(NamedTuple):
@@ -135,8 +139,20 @@ def read_stereo_pair(
     return StereoPair(*read_image_pair(frame.left, frame.right, where, bits=bits, size_px=size_px))
 
 
+UNPOSED = make_pose_track(np.zeros(1), np.eye(4)[None], where="--poses odometry")
+"""Stands for the poses that are estimated later, from the images."""
+
+
+def from_images(options: ReadOptions) -> bool:
+    """Whether the poses are to be estimated from the images: `--poses odometry`, and no file is called so."""
+    path = options.poses
+    return path is not None and path == Path("odometry") and not path.is_file()
+
+
 def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False) -> PoseTrack:
     """The poses given by the options, else those of the sequence, in metres and of the left camera's optical axes.
+
+    `UNPOSED` where the images are to give them.
 
     Args:
         options: `poses` has precedence; the conventions of the file.
@@ -146,11 +162,14 @@ def read_pose_track(options: ReadOptions, own: Path, *, allow_body: bool = False
     Raises:
         JaxmapError: there are none, or they are poses of a body and the reader cannot use them.
     """
+    if from_images(options):
+        return UNPOSED
     path = options.poses or own
     if not options.poses and not own.is_file():
         raise JaxmapError(
             f"the sequence has no poses: there is no file {own}",
-            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera)",
+            fix="give them with --poses FILE (TUM text, T_world_camera of the left camera), "
+            "or estimate them from the images: --poses odometry",
         )
     track = read_poses(path, options.quaternion, options.poses_time_unit)
     notes = [*track.notes]
@@ -230,6 +249,7 @@ def assemble(
     """
     timestamps_s = np.array([frame.timestamp_s for frame in frames], np.float64)
     _check_frames(frames, timestamps_s, camera, where, size_px)
+    unposed = track is UNPOSED
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
     if options.poses_time_unit == "auto":
@@ -239,6 +259,19 @@ def assemble(
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
 
     selected = _selected(len(frames), options, where)
+    if unposed:
+        # All of them: a stride comes after the odometry, which needs every frame.
+        seen, all_notes = tuple(frames[options.start : options.stop]), list(notes)
+        return StereoSequence(
+            name=name,
+            dataset=dataset,
+            camera=with_baseline_unit(camera, options.baseline_unit),
+            frames=seen,
+            T_world_camera=np.tile(np.eye(4), (len(seen), 1, 1)),
+            read_pair=read_pair or _reader_of_files(frames, camera, options, all_notes),
+            notes=tuple(all_notes),
+            true_disparity=true_disparity,
+        )
     kept = selected[has_pose[selected]]
     if not len(kept):
         raise _no_pose(timestamps_s[selected], track, options)

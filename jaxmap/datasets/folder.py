@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.base import UNPOSED, FrameRef, Reader, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.images import list_images
 from jaxmap.datasets.options import ReadOptions
@@ -115,8 +115,8 @@ def _timed_images(
         images = sorted(images, key=lambda image: float(key[image]))
         times = np.array([float(key[image]) for image in images])
         return images, times / units_per_second(times), "times of the frames from the file names"
-    if len(images) == len(track.T):
-        if track.timestamps_s is None:
+    if track is UNPOSED or len(images) == len(track.T):
+        if track is UNPOSED or track.timestamps_s is None:
             return images, np.arange(float(len(images))), "frames numbered 0, 1, 2 ... s, as no times are known"
         return images, track.timestamps_s, "times of the frames from the poses, one for each"
     raise JaxmapError(

@@ -25,7 +25,7 @@ from jaxtyping import Float64
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from jaxmap.datasets.base import FrameRef, Reader, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.base import UNPOSED, FrameRef, Reader, StereoSequence, assemble, read_pose_track
 from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.crs import to_utm, utm_crs
 from jaxmap.datasets.images import list_images
@@ -34,7 +34,7 @@ from jaxmap.datasets.poses import PoseTrack, make_pose_track
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import MOST_TEXT_BYTES
 from jaxmap.host.files import config_folder, read_bytes
-from jaxmap.localisation.estimate import estimate_poses
+from jaxmap.localisation.estimate import estimate_poses, estimate_up
 from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, time_to_nearest
 
 Log = TypeVar("Log", GpsFixes, ImuLog, WheelLog)
@@ -177,7 +177,7 @@ def open_katwijk(folder: Path, options: ReadOptions) -> StereoSequence:
         track, T_child_camera = read_pose_track(options, options.poses), None
         east, north, _ = np.nanmedian(track.T[:, :3, 3], axis=0)
         crs = CRS if 1e5 < east < 9e5 and 1e4 < north < 1e7 else None
-        pose_notes = [] if crs else ["the poses given are not UTM: name their system with --crs"]
+        pose_notes = [] if crs or track is UNPOSED else ["the poses given are not UTM: name their system with --crs"]
     else:
         frame_times_s = np.array([frame.timestamp_s for frame in frames])
         track, crs, pose_notes = _estimate_track(folder, options, frame_times_s)
@@ -274,6 +274,26 @@ def body_to_camera(
     if far := int((away_s > MAX_TIME_FROM_PAN_TILT_S).sum()):
         notes.append(f"{far} of {len(timestamps_s)} frames have no pan and tilt within {MAX_TIME_FROM_PAN_TILT_S:g} s")
     return T_body_imu @ camera.T_imu_mount @ T_mount_turned @ camera.T_mount_camera, notes
+
+
+def up_in_camera(sequence: StereoSequence) -> Float64[np.ndarray, "N 3"] | None:
+    """The direction up in the left camera's frame, for each frame of a part, by its inclinometer and gyros.
+
+    NaN where a frame lies outside their times; None for a sequence of another kind, or without them.
+    """
+    images = sequence.frames[0].left.parent
+    camera = next((camera for camera in CAMERAS.values() if camera.folder == images.name), None)
+    if sequence.dataset != READER.name or camera is None:
+        return None
+    timestamps_s = np.array([frame.timestamp_s for frame in sequence.frames])
+    try:
+        (imu, _), (wheels, _) = read_imu(images.parent), read_wheels(images.parent)
+        imu, wheels = _near_frames(imu, timestamps_s), _near_frames(wheels, timestamps_s) if wheels else None
+        up_body = estimate_up(imu, wheels if wheels and len(wheels.timestamps_s) > 1 else None, timestamps_s)
+        T_body_camera, _ = body_to_camera(images.parent, camera, timestamps_s)
+    except JaxmapError:
+        return None
+    return np.einsum("...ji,...j->...i", T_body_camera[..., :3, :3], up_body)
 
 
 def pair_images(folder: Path) -> tuple[list[FrameRef], list[str]]:

@@ -69,7 +69,7 @@ class ReadOptions:
     dataset: str = "auto"
     """The reader: auto, kitti, euroc, folder, katwijk, planetary, asp, rosbag, madmax, tartanair or middlebury."""
     poses: Path | None = None
-    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text."""
+    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
     poses_world: PosesWorld = "auto"
     """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
     pose_convention: PoseConvention = "auto"

@@ -16,10 +16,11 @@ from jaxmap.datasets import (
     rosbag,
     tartanair,
 )
-from jaxmap.datasets.base import Reader, StereoSequence
+from jaxmap.datasets.base import OnFrame, Reader, StereoSequence, from_images
 from jaxmap.datasets.crs import check_crs, check_metres
 from jaxmap.datasets.options import ReadOptions
 from jaxmap.datasets.samples import open_sample
+from jaxmap.datasets.visual_odometry import with_odometry
 from jaxmap.errors import JaxmapError, UsageError
 
 SAMPLE_PREFIX = "sample:"
@@ -52,8 +53,15 @@ def register(reader: Reader) -> None:
     READERS[reader.name] = reader
 
 
-def open_sequence(source: str | Path, options: ReadOptions | None = None) -> StereoSequence:
+def open_sequence(
+    source: str | Path, options: ReadOptions | None = None, on_frame: OnFrame = lambda done, total: None
+) -> StereoSequence:
     """Opens the folder of one sequence, a file that holds one (a bag), or `sample:NAME` for a bundled one.
+
+    Args:
+        source: the folder or sample.
+        options: how it is read.
+        on_frame: is told of the progress of odometry, the one thing that takes long.
 
     Raises:
         UsageError: an option names no reader, no camera or no coordinate reference system.
@@ -67,7 +75,7 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
     if options.crs is not None:
         check_crs(options.crs)
     if str(source).startswith(SAMPLE_PREFIX):
-        return _in_metres(open_sample(str(source).removeprefix(SAMPLE_PREFIX), options))
+        return _posed(open_sample(str(source).removeprefix(SAMPLE_PREFIX), options), options, on_frame)
     path = Path(source)
     if not path.is_dir() and not (path.is_file() and any(reader.recognises(path) for reader in READERS.values())):
         what = f"{source} is a file, but no bag" if path.exists() else f"there is no folder {source}"
@@ -76,14 +84,14 @@ def open_sequence(source: str | Path, options: ReadOptions | None = None) -> Ste
     if options.camera is not None and options.camera not in reader.cameras:
         fix = f"choose {' or '.join(reader.cameras)}" if reader.cameras else "leave the option out"
         raise UsageError(f"{reader.name} has no camera {options.camera!r}", where="--camera", fix=fix)
-    return _in_metres(reader.open(path, options))
+    return _posed(reader.open(path, options), options, on_frame)
 
 
-def _in_metres(sequence: StereoSequence) -> StereoSequence:
-    """The sequence, whose coordinate reference system must be one of metres."""
+def _posed(sequence: StereoSequence, options: ReadOptions, on_frame: OnFrame) -> StereoSequence:
+    """The sequence in metres, with the poses that its images give where these are asked for."""
     if sequence.crs is not None:
         check_metres(sequence.crs, sequence.T_world_camera[:, :3, 3] + sequence.site_origin)
-    return sequence
+    return with_odometry(sequence, options, katwijk.up_in_camera, on_frame) if from_images(options) else sequence
 
 
 def _recognise(path: Path) -> Reader:

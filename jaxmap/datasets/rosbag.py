@@ -29,7 +29,7 @@ from jaxmap.datasets.bag_topics import (
     info_topic,
     is_rectified_name,
 )
-from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, read_pose_track
+from jaxmap.datasets.base import FrameRef, Reader, StereoPair, StereoSequence, assemble, from_images, read_pose_track
 from jaxmap.datasets.bit_depth import bits_note, used_bits
 from jaxmap.datasets.calibration_files import read_calibration
 from jaxmap.datasets.options import Bits, ReadOptions
@@ -67,7 +67,7 @@ def open_rosbag(path: Path, options: ReadOptions) -> StereoSequence:
         found = BagPoses(read_pose_track(options, path), np.eye(4), "", [])
     else:
         found = _bag_poses(log, (poses, bag.topics[poses].type), imu, shots[0][0].frame, times_s, options)
-    if gps is not None and imu is None:
+    if gps is not None and imu is None and not from_images(options):
         found = georeferenced(found, log, gps, options)
     places = {str(left.time_ns): (left.place, right.place) for left, right in shots}
     reader = _PairReader(bag, pair, places, options.image_bits)

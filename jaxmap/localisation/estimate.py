@@ -100,6 +100,29 @@ def estimate_poses(
     )
 
 
+def estimate_up(
+    imu: ImuLog, wheels: WheelLog | None, timestamps_s: Float64[np.ndarray, "N"]
+) -> Float64[np.ndarray, "N 3"]:
+    """The direction up in the body frame (x forward, y left, z up) at given times, NaN outside those of the IMU.
+
+    Raises:
+        JaxmapError: the IMU says too little.
+    """
+    up = np.full((len(timestamps_s), 3), np.nan)
+    within = (timestamps_s >= imu.timestamps_s[0]) & (timestamps_s <= imu.timestamps_s[-1])
+    if not within.any():
+        return up
+    knots_s = knot_times(imu.timestamps_s, timestamps_s[within])
+    try:
+        roll, pitch = estimate_roll_pitch(imu, knots_s, _acceleration(imu, wheels, knots_s))
+    except (np.linalg.LinAlgError, ValueError, FloatingPointError) as fault:
+        raise JaxmapError(f"no attitude fits the IMU ({fault})") from fault
+    at = np.searchsorted(knots_s, timestamps_s[within])
+    roll, pitch = roll[at], pitch[at]
+    up[within] = np.stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)], axis=-1)
+    return up
+
+
 def knot_times(imu_s: Float64[np.ndarray, "N"], fixes_s: Float64[np.ndarray, "F"]) -> Float64[np.ndarray, "K"]:
     """The times of all fixes and of IMU samples about `KNOT_SPACING_S` apart."""
     cells = np.floor((imu_s - imu_s[0]) / KNOT_SPACING_S)

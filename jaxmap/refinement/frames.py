@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, UInt8
 from scipy.ndimage import distance_transform_edt
 
-from jaxmap.types import StereoCamera
+from jaxmap.types import Pinhole
 
 EDGE_PX = 2.0
 """Disparities that differ by more within a few pixels lie on two surfaces."""
@@ -39,22 +39,6 @@ def make_disparity_frame(image: np.ndarray, disparity_px: np.ndarray) -> Dispari
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     assert isinstance(nearest, np.ndarray)
     return DisparityFrame(grey, np.where(known, disparity_px, np.nan).astype(np.float32), disparity_px[tuple(nearest)])
-
-
-class Pinhole(NamedTuple):
-    """The numbers of a rectified stereo camera in float64, for the host."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    baseline_m: float
-    doffs_px: float
-
-
-def pinhole(camera: StereoCamera) -> Pinhole:
-    """The numbers of a camera."""
-    return Pinhole(*(float(getattr(camera, name)) for name in Pinhole._fields))
 
 
 def unproject(

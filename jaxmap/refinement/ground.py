@@ -19,11 +19,11 @@ from scipy.spatial import KDTree
 
 from jaxmap.evaluation.truth_cells import Alignment, register
 from jaxmap.fusion.splat import splat_columns
-from jaxmap.refinement.frames import Pinhole, PixelSamples
+from jaxmap.refinement.frames import PixelSamples
 from jaxmap.refinement.residuals import HeightField, Linearised, linearise, make_device_rig
 from jaxmap.refinement.rig import PER_FRAME, SHARED, Rig
 from jaxmap.refinement.solver import ResidualTerm
-from jaxmap.types import GridSpec, make_grid
+from jaxmap.types import GridSpec, Pinhole, make_grid
 
 HEIGHT_SIGMA_M = 0.03
 FRAME_WEIGHT = 30.0

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int
 
-from jaxmap.refinement.frames import EDGE_PX, DisparityFrame, Pinhole, sample_bilinear, unproject
+from jaxmap.refinement.frames import EDGE_PX, DisparityFrame, sample_bilinear, unproject
+from jaxmap.types import Pinhole
 
 PATCH_PX = 21
 """Edge of a patch, at the scale of the image it is compared in."""

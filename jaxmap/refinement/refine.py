@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.errors import JaxmapError
 from jaxmap.refinement.consistency import Consistency, consistency_of
-from jaxmap.refinement.frames import DisparityFrame, Pinhole, PixelSamples, sample_bilinear, sample_pixels
+from jaxmap.refinement.frames import DisparityFrame, PixelSamples, sample_bilinear, sample_pixels
 from jaxmap.refinement.ground import (
     GroundRaster,
     ground_contact,
@@ -33,6 +33,7 @@ from jaxmap.refinement.solver import (
     Solution,
     solve,
 )
+from jaxmap.types import Pinhole
 
 MATCH_SIGMA_PX, DISPARITY_SIGMA_PX = 0.25, 0.25
 PAIR_WEIGHT = 30.0

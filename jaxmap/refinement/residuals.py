@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmap.fusion.splat import sample_columns
-from jaxmap.refinement.frames import Pinhole
 from jaxmap.refinement.rig import PER_FRAME, SHARED, Rig
-from jaxmap.types import GridSpec
+from jaxmap.types import GridSpec, Pinhole
 
 CHUNK = 4096
 """Residuals are computed in chunks of one size, so that one compiled program serves any number of them."""

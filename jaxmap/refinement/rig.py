@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from jaxmap.refinement.frames import Pinhole, PixelSamples, unproject
+from jaxmap.refinement.frames import PixelSamples, unproject
+from jaxmap.types import Pinhole
 
 SHARED = 8
 """Parameters that all frames share: mounting (3 m, 3 rad), logarithm of the baseline's scale, disparity offset."""

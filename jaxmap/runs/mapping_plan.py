@@ -16,6 +16,7 @@ from jaxtyping import Float, PRNGKeyArray
 from jaxmap.checks.check import open_front_end
 from jaxmap.checks.finding import Finding
 from jaxmap.datasets import StereoSequence, open_sequence
+from jaxmap.datasets.base import OnFrame
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.ensemble.draws import draw_ensemble
@@ -298,18 +299,19 @@ class Plan:
         return hashlib.sha256(repr((described, camera)).encode() + poses.tobytes()).hexdigest()[:16]
 
 
-def plan_run(source: str, config: MapConfig, notify: Notify) -> Plan:
+def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame = lambda done, total: None) -> Plan:
     """Opens the sequence and decides range, bounds, labeller and step.
 
     Args:
         source: the folder of one sequence, or `sample:NAME`.
         config: the settings.
         notify: takes lines for the user.
+        on_frame: is told of the progress of odometry, where it gives the poses.
 
     Raises:
         JaxmapError: the data or the settings do not serve.
     """
-    sequence = open_sequence(source, config)
+    sequence = open_sequence(source, config, on_frame)
     if config.strict and sequence.pose_faults:
         raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
     front_end = open_front_end(sequence, config.stereo, notify)

@@ -28,7 +28,7 @@ from jaxmap.host.files import real_path
 from jaxmap.host.output_folder import check_inputs_stay, locked, write_json
 from jaxmap.host.prefetch import prefetch
 from jaxmap.host.replacement import Replacement
-from jaxmap.refinement.frames import DisparityFrame, make_disparity_frame, pinhole
+from jaxmap.refinement.frames import DisparityFrame, make_disparity_frame
 from jaxmap.refinement.ground import GroundRaster
 from jaxmap.refinement.refine import GroundReference, Refinement, refine, results
 from jaxmap.refinement.solver import Prior
@@ -38,7 +38,7 @@ from jaxmap.runs.evaluation import TruthOptions, read_truth
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
 from jaxmap.stereo.rectify import StereoRig
-from jaxmap.types import StereoCamera
+from jaxmap.types import StereoCamera, pinhole
 
 RESULTS = "refine.json"
 """Written first: a folder that holds it holds a refinement."""
@@ -220,7 +220,7 @@ def read_inputs(
         JaxmapError: the sequence cannot be read, fewer than two of its frames can, or the check stops it (`strict`).
     """
     started_s = time.perf_counter()
-    sequence = open_sequence(source, options)
+    sequence = open_sequence(source, options, lambda done, total: advance(0.0, f"odometry {done} of {total}"))
     for note in sequence.notes:
         notify(f"note: {note}")
     front_end = open_front_end(sequence, StereoOptions(align=align), notify)

@@ -26,12 +26,12 @@ from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.bounds import usable_depth
 from jaxmap.geometry.options import DepthOptions
-from jaxmap.refinement.frames import pinhole
 from jaxmap.refinement.refine import GroundReference, refine
 from jaxmap.refinement.rig import vehicle_axes
 from jaxmap.refinement.solver import Prior
 from jaxmap.runs.config import MapConfig
 from jaxmap.runs.refinement import DEPTH_SIGMA_M, GroundFiles, RefineInputs, read_ground, read_inputs
+from jaxmap.types import pinhole
 
 POSITION_M, ANGLE_RAD = 0.2, np.radians(1.0)
 PITCH_RAD, HEIGHT_M = np.radians(2.0), 0.1

@@ -98,7 +98,7 @@ def test_images_without_a_partner_are_dropped_and_noted(tmp_path):
 def test_missing_ground_truth_is_reported(tmp_path):
     assert refused(made_recording(tmp_path, ground_truth=False)) == (
         "the sequence has no poses: there is no file REC/mav0/state_groundtruth_estimate0/data.csv; give them with "
-        "--poses FILE (TUM text, T_world_camera of the left camera)"
+        "--poses FILE (TUM text, T_world_camera of the left camera), or estimate them from the images: --poses odometry"
     )
 
 

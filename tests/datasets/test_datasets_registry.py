@@ -126,7 +126,7 @@ def test_missing_poses_and_poses_of_a_body_are_reported(tmp_path):
     folder = plain_folder(tmp_path, poses=0)
     assert refused(folder) == (
         "the sequence has no poses: there is no file SOURCE/poses.tum; give them with --poses FILE (TUM text, "
-        "T_world_camera of the left camera)"
+        "T_world_camera of the left camera), or estimate them from the images: --poses odometry"
     )
     csv = tmp_path / "data.csv"
     csv.write_text("0,0,0,0,1,0,0,0\n")

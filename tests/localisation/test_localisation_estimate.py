@@ -25,7 +25,7 @@ from jaxmap.datasets.katwijk import read_gps, read_imu, read_wheels
 from jaxmap.datasets.poses import make_pose_track, poses_at
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.geometry_scores import PoseErrors, pose_errors
-from jaxmap.localisation.estimate import estimate_poses, knot_times
+from jaxmap.localisation.estimate import estimate_poses, estimate_up, knot_times
 from jaxmap.localisation.sensors import GpsFixes, ImuLog, RoverGeometry, WheelLog, in_gap, increments, time_to_nearest
 
 GOOD_SENSORS = Sensors()
@@ -235,3 +235,13 @@ def test_knots_hold_every_fix_and_lie_apart(imu_s, fixes_s):
     assert np.isin(fixes_s, knots_s).all()
     assert np.isin(knots_s, np.concatenate([imu_s, fixes_s])).all()
     assert (np.diff(knots_s) > 0).all()
+
+
+def test_up_is_where_the_inclinometer_points_and_unknown_outside_its_times():
+    times_s = np.arange(0, 10, 0.01)
+    up = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0])
+    imu = ImuLog(times_s, np.zeros((len(times_s), 3)), np.tile(9.81 * up, (len(times_s), 1)))
+    found = estimate_up(imu, None, np.array([-1.0, 0.5, 3.0, 11.0]))
+    np.testing.assert_allclose(found[1:3], [up, up], atol=1e-3)
+    assert np.isnan(found[[0, 3]]).all()
+    assert np.isnan(estimate_up(imu, None, np.array([20.0]))).all()

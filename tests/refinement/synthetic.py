@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxmap.refinement.frames import Pinhole
 from jaxmap.refinement.matching import MatchTable
 from jaxmap.refinement.residuals import linearise, make_device_rig
 from jaxmap.refinement.rig import Rig
 from jaxmap.refinement.solver import ResidualTerm
+from jaxmap.types import Pinhole
 
 CAMERA = Pinhole(fx_px=400.0, fy_px=410.0, cx_px=255.0, cy_px=190.0, baseline_m=0.12, doffs_px=0.5)
 WIDTH_PX, HEIGHT_PX = 512, 384

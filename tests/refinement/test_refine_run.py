@@ -27,7 +27,6 @@ from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.output_folder import locked
 from jaxmap.refinement.consistency import Consistency
-from jaxmap.refinement.frames import pinhole
 from jaxmap.refinement.refine import GroundReference, Refinement, refine
 from jaxmap.refinement.rig import PER_FRAME, SHARED, make_rig
 from jaxmap.refinement.solver import Prior, Solution
@@ -42,7 +41,7 @@ from jaxmap.runs.refinement import (
     run_refine,
 )
 from jaxmap.stereo.rectify import make_rectifier, make_stereo_rig
-from jaxmap.types import make_grid
+from jaxmap.types import make_grid, pinhole
 
 FRAMES = 4
 T_TRUE = np.stack([pose(index) for index in range(FRAMES)])
