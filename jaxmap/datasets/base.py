@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -249,29 +249,25 @@ def assemble(
     """
     timestamps_s = np.array([frame.timestamp_s for frame in frames], np.float64)
     _check_frames(frames, timestamps_s, camera, where, size_px)
-    unposed = track is UNPOSED
-    if track.timestamps_s is None:
-        track = with_timestamps(track, timestamps_s)
-    if options.poses_time_unit == "auto":
-        track = in_unit_of_frames(track, timestamps_s, options.max_pose_gap_s)
-    track = without_wild_poses(track)
+    selected, all_notes = _selected(len(frames), options, where), list(notes)
+    read_pair = read_pair or _reader_of_files(frames, camera, options, all_notes)
+    common: dict[str, Any] = {
+        "name": name,
+        "dataset": dataset,
+        "camera": with_baseline_unit(camera, options.baseline_unit),
+        "read_pair": read_pair,
+        "true_disparity": true_disparity,
+    }
+    if track is UNPOSED:
+        # All of them: a stride comes after the odometry, which needs every frame.
+        seen = tuple(frames[options.start : options.stop])
+        return StereoSequence(
+            frames=seen, T_world_camera=np.tile(np.eye(4), (len(seen), 1, 1)), notes=tuple(all_notes), **common
+        )
+    track = _timed(track, timestamps_s, options)
     assert track.timestamps_s is not None
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
 
-    selected = _selected(len(frames), options, where)
-    if unposed:
-        # All of them: a stride comes after the odometry, which needs every frame.
-        seen, all_notes = tuple(frames[options.start : options.stop]), list(notes)
-        return StereoSequence(
-            name=name,
-            dataset=dataset,
-            camera=with_baseline_unit(camera, options.baseline_unit),
-            frames=seen,
-            T_world_camera=np.tile(np.eye(4), (len(seen), 1, 1)),
-            read_pair=read_pair or _reader_of_files(frames, camera, options, all_notes),
-            notes=tuple(all_notes),
-            true_disparity=true_disparity,
-        )
     kept = selected[has_pose[selected]]
     if not len(kept):
         raise _no_pose(timestamps_s[selected], track, options)
@@ -284,7 +280,7 @@ def assemble(
     T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
 
-    all_notes = [*notes, *track.notes, *track.faults]
+    all_notes += [*track.notes, *track.faults]
     if options.poses_world == "auto" and not np.array_equal(T_world_source, np.eye(4)):
         all_notes.append("the poses' world is taken for camera-like (y down) and turned z-up")
     if len(kept) < len(selected):
@@ -292,25 +288,29 @@ def assemble(
             f"{len(selected) - len(kept)} of {len(selected)} frames have no pose and are left out: "
             f"the frames span {_span(timestamps_s[selected])}, the poses {_span(track.timestamps_s)}"
         )
-    read_pair = read_pair or _reader_of_files(frames, camera, options, all_notes)
     row_of_frame = np.cumsum(has_pose) - 1
     return StereoSequence(
-        name=name,
-        dataset=dataset,
-        camera=with_baseline_unit(camera, options.baseline_unit),
         frames=tuple(frames[index] for index in kept),
         T_world_camera=T_world_camera[row_of_frame[kept]],
-        read_pair=read_pair,
         T_world_source=T_world_source,
         site_origin=site_origin,
         crs=options.crs or crs,
         notes=tuple(all_notes),
-        true_disparity=true_disparity,
         pose_faults=track.faults,
         pose_reading=reading_of(options, track)._replace(
             poses_world=next(name for name, T in T_Z_UP_SOURCE.items() if np.array_equal(T, T_world_source))
         ),
+        **common,
     )
+
+
+def _timed(track: PoseTrack, timestamps_s: np.ndarray, options: ReadOptions) -> PoseTrack:
+    """The track with times of the frames' unit, and without wild poses."""
+    if track.timestamps_s is None:
+        track = with_timestamps(track, timestamps_s)
+    if options.poses_time_unit == "auto":
+        track = in_unit_of_frames(track, timestamps_s, options.max_pose_gap_s)
+    return without_wild_poses(track)
 
 
 def _selected(count: int, options: ReadOptions, where: object) -> np.ndarray:

@@ -88,6 +88,7 @@ def trained(given: Given, fault: str, *words: object) -> list[object]:
 
 FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "unknown command": (2, lambda given: ["mapp"]),
+    "check: no sequence": (1, lambda given: ["check", given.folder / "nowhere"]),
     "map: pose with a word": (1, lambda given: mapped(given, damage=worded_pose)),
     "map: truncated image, strictly": (1, lambda given: mapped(given, "--strict", damage=truncated)),
     "map: all frames unreadable": (1, lambda given: mapped(given, damage=all_unreadable)),

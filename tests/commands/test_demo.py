@@ -30,7 +30,7 @@ def test_a_row_of_the_demo(cli, monkeypatch, tmp_path):
     _, config = demo_rows()["plane_chiodini2020"]
     # Labels from files: the quickest step to compile.
     labels = dict(labeller="files", labels=sample_truth() / "labels", labels_are="raw")
-    config = replace(config, stop=2, stereo=replace(config.stereo, num_disparities=64), **labels)
+    config = replace(config, stop=2, stereo=replace(config.stereo, num_disparities=64, near_guard=False), **labels)
     monkeypatch.setattr(command, "demo_rows", lambda: {"true": ("true labels", config)})
     outcome = cli("demo", "--out", tmp_path / "demo")
     assert outcome.status == 0, outcome.err

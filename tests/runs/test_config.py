@@ -98,7 +98,7 @@ def test_a_config_comes_back_from_its_tree_and_from_yaml(config):
 
 
 def test_every_setting_has_a_default_and_says_what_it_is():
-    sections = ("grid", "depth", "stereo", "fusion", "plane", "relief", "deeplab", "ensemble")
+    sections = ("grid", "depth", "stereo", "fusion", "plane", "relief", "deeplab", "ensemble", "bag")
     kinds = (GridOptions, DepthOptions, FusionOptions, PlaneOptions, DeeplabOptions, StereoOptions, EnsembleOptions)
     for kind in (MapConfig, *kinds):
         source = "".join(inspect.getsource(one) for one in kind.__mro__ if is_dataclass(one))

@@ -173,7 +173,7 @@ def damaged_map(run: Path) -> None:
         (("--truth-crs", "EPSG:32632"), 1, "does not lie over the map"),
         (("--backdrop", "nowhere.tif"), 1, "no such file"),
         (("--out", "scores.txt"), 2, "not a .json file"),
-        (("--rock-diameters-m", "1", "0", "1"), 2, "not positive"),
+        (("--rock-diameters-m", "1", "0", "1"), 2, "--rock-diameters-m is 0.0"),
     ],
 )
 def test_faults_are_one_line_and_write_nothing(cli, run, tmp_path, words, status, said):

@@ -115,7 +115,7 @@ def test_a_disparity_of_an_image_with_a_rotation_tag_is_refused(copy):
 @pytest.mark.parametrize("content", ["{", '{"fx_px": 40}', UNLEVEL], ids=["truncated", "incomplete", "no unit vector"])
 def test_a_camera_that_is_none_is_refused(copy, content):
     (copy / "cameras" / f"{NAME}.json").write_text(content)
-    with pytest.raises(JaxmapError, match="the camera cannot be read"):
+    with pytest.raises(JaxmapError, match="the camera cannot be read|not readable as JSON"):
         read_stereo(copy, NAME)
 
 
