@@ -250,20 +250,17 @@ def assemble(
     timestamps_s = np.array([frame.timestamp_s for frame in frames], np.float64)
     _check_frames(frames, timestamps_s, camera, where, size_px)
     selected, all_notes = _selected(len(frames), options, where), list(notes)
-    read_pair = read_pair or _reader_of_files(frames, camera, options, all_notes)
     common: dict[str, Any] = {
         "name": name,
         "dataset": dataset,
         "camera": with_baseline_unit(camera, options.baseline_unit),
-        "read_pair": read_pair,
+        "read_pair": read_pair or _reader_of_files(frames, camera, options, all_notes),
         "true_disparity": true_disparity,
     }
     if track is UNPOSED:
         # All of them: a stride comes after the odometry, which needs every frame.
-        seen = tuple(frames[options.start : options.stop])
-        return StereoSequence(
-            frames=seen, T_world_camera=np.tile(np.eye(4), (len(seen), 1, 1)), notes=tuple(all_notes), **common
-        )
+        seen, notes = tuple(frames[options.start : options.stop]), tuple(all_notes)
+        return StereoSequence(frames=seen, T_world_camera=np.tile(np.eye(4), (len(seen), 1, 1)), notes=notes, **common)
     track = _timed(track, timestamps_s, options)
     assert track.timestamps_s is not None
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
