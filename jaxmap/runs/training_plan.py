@@ -233,6 +233,8 @@ def plan_image_training(
     relief = network.architecture.relief_channels > 0
     if relief:
         training_set = with_stereo(training_set)
+        if not any(example.stereo for example in training_set.train):
+            _say_without_relief(config, folder, notify)
     counts = check_training_set(training_set)
     shares = zip(config.classes, counts[0] / counts[0].sum(), strict=True)
     notify(
@@ -253,6 +255,21 @@ def plan_image_training(
         training_set, counts, ExampleReader(training_set.train, training_set.lookup, relief=relief)
     )
     return TrainingPlan(config, data, network, init, order, trainer)
+
+
+def _say_without_relief(config: TrainConfig, folder: Path, notify: Callable[[str], None]) -> None:
+    """A network that sees relief may be trained on images alone, unless relief was asked for.
+
+    Raises:
+        UsageError: it was.
+    """
+    if config.network.relief:
+        raise UsageError(
+            "no training image has a disparity, and network.relief is given",
+            where=folder,
+            fix="put disparity/NAME.png and cameras/NAME.json beside images and masks, or leave out --network.relief",
+        )
+    notify("note: no training image has a disparity: the network, which also sees relief, learns from images alone")
 
 
 def describe_network(network: InitialNetwork) -> str:

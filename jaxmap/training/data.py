@@ -121,7 +121,7 @@ def with_stereo(training_set: TrainingSet) -> TrainingSet:
     """The same examples, with the disparity and the camera of those that have them.
 
     Raises:
-        JaxmapError: no training image has them.
+        JaxmapError: an image that has them carries a rotation tag.
     """
     folder = training_set.folder
 
@@ -132,12 +132,6 @@ def with_stereo(training_set: TrainingSet) -> TrainingSet:
         )
 
     result = training_set._replace(train=added(training_set.train), validation=added(training_set.validation))
-    if not any(example.stereo for example in result.train):
-        raise JaxmapError(
-            "no training image has a disparity, and the network sees relief",
-            where=folder,
-            fix="put disparity/NAME.png and cameras/NAME.json beside images and masks, or leave out --network.relief",
-        )
     for example in (*result.train, *result.validation):
         if example.stereo and image_rotation_tag(example.image) != 1:
             raise JaxmapError(

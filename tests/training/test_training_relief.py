@@ -14,16 +14,18 @@ import pytest
 from fixtures import cli, shared_cache  # noqa: F401
 from PIL import Image
 from tiny_training import ARCHITECTURE, network_is_tiny, train_words, write_data_and_config  # noqa: F401
-from training_data import CLASSES
+from training_data import CLASSES, write_data
 
 from jaxmap.datasets.stereo_images import LevelCamera, read_stereo, write_stereo
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.geometry.relief import RELIEF_CHANNELS, relief_channels, relief_of
+from jaxmap.host.files import bundled
 from jaxmap.models.checkpoint import load_network
 from jaxmap.models.deeplab import initial_weights
+from jaxmap.runs.training_plan import TrainConfig, plan_image_training
 from jaxmap.training.batches import ExampleOrder, ExampleReader
 from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set, with_stereo
-from jaxmap.training.options import AugmentationOptions, TrainingOptions
+from jaxmap.training.options import AugmentationOptions, NetworkOptions, TrainingOptions
 from jaxmap.training.relief import read_relief
 from jaxmap.training.step import Batch, make_trainer
 from jaxmap.types import make_stereo_camera
@@ -96,8 +98,7 @@ def test_faults_of_disparities_are_found_before_training(copy):
     with pytest.raises(JaxmapError, match=r"no such file in .*i0.json"):
         check_training_set(opened(copy))
     (copy / "disparity" / f"{NAME}.png").unlink()
-    with pytest.raises(JaxmapError, match="no training image has a disparity"):
-        opened(copy)
+    assert not any(example.stereo for example in opened(copy).train)
 
 
 def test_a_disparity_of_an_image_with_a_rotation_tag_is_refused(copy):
@@ -146,3 +147,17 @@ def test_a_run_with_relief_says_so(cli, data, tmp_path):
     assert status == 0, errors
     assert load_network(out / "model.safetensors").architecture.relief_channels == RELIEF_CHANNELS
     assert "5, 1 with relief" in (out / "report.html").read_text("utf8")
+
+
+def test_a_network_that_sees_relief_is_trained_on_images_alone(tmp_path):
+    folder, init, notes = write_data(tmp_path), bundled("rover.safetensors"), []
+    for path in (folder / "masks").iterdir():
+        labels = np.asarray(Image.open(path))
+        Image.fromarray(np.where(labels == 255, 0, labels + 1).astype(np.uint8)).save(path)
+    config = TrainConfig(batch_size=1, augmentation=AugmentationOptions(crop_px=(32, 32)))
+    plan = plan_image_training(folder, config, init, notify=notes.append)
+    assert any("learns from images alone" in note for note in notes)
+    assert plan.network.architecture.relief_channels
+    asked_for = replace(config, network=NetworkOptions(relief=True))
+    with pytest.raises(UsageError, match="no training image has a disparity, and network.relief is given"):
+        plan_image_training(folder, asked_for, init, notify=notes.append)
