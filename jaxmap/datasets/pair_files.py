@@ -107,7 +107,9 @@ def _by_time(keys: Sequence[str], right_keys: Sequence[str], left: Sequence[Path
     times_ns = [np.array([min(max(time - first, -_FAR_NS), _FAR_NS) for time in side], np.int64) for side in whole]
     orders = [np.argsort(times, kind="stable") for times in times_ns]
     left_ns, right_ns = (times[order] for times, order in zip(times_ns, orders, strict=True))
-    tolerance_ns = int(np.median(np.diff(left_ns))) // 2 if len(left) > 1 else _LONE_TOLERANCE_NS
+    gaps_ns = np.concatenate([np.diff(left_ns), np.diff(right_ns)])
+    # Where frames are lost gaps are longer than the time between frames, so that the short ones tell it.
+    tolerance_ns = int(np.quantile(gaps_ns, 0.1, method="lower")) // 2 if len(gaps_ns) else _LONE_TOLERANCE_NS
     mine, theirs, nearest_ns = nearest_pairs(left_ns, right_ns, tolerance_ns)
     if not len(mine):
         raise JaxmapError(

@@ -115,7 +115,7 @@ def run(inputs, state, scene_folder, monkeypatch):
         on_round(state)
         return state
 
-    monkeypatch.setattr(jaxmap.runs.refinement, "read_inputs", lambda *_: inputs)
+    monkeypatch.setattr(jaxmap.runs.refinement, "read_inputs", lambda *_, **__: inputs)
     monkeypatch.setattr(jaxmap.runs.refinement, "refine", refined)
 
     def run(out: Path, prior: Prior | None = None, **more: object) -> dict:
@@ -312,7 +312,7 @@ def test_a_refinement_that_fails_leaves_the_earlier_one(run, tmp_path, monkeypat
 
 
 def test_what_cannot_be_written_is_refused_before_the_work(scene_folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(jaxmap.runs.refinement, "read_inputs", lambda *_: pytest.fail("it reads first"))
+    monkeypatch.setattr(jaxmap.runs.refinement, "read_inputs", lambda *_, **__: pytest.fail("it reads first"))
 
     def refused(out: Path) -> str:
         with pytest.raises(JaxmapError) as caught:

@@ -443,7 +443,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_its_images(plan, whol
 
 @pytest.mark.slow
 def test_a_rate_far_too_high_is_one_line(cli, tiny_data, tmp_path):
-    words = ("--optimiser.learning-rate", "1e9", "--norm.head", "frozen", "--norm.backbone", "frozen")
+    words = ("--optimiser.learning-rate", "1e6", "--norm.head", "frozen", "--norm.backbone", "frozen")
     outcome = cli(*train_words(tiny_data, tmp_path / "run", *words, "--validate-every", "1"))
     assert outcome.status == 1
     assert "finite" in outcome.error or "loss " in outcome.error

@@ -231,7 +231,7 @@ def test_two_traverses_and_the_plane_with_a_soft_threshold(cli, scene_folder, tr
     out = tmp_path / "plane.yaml"
     words = ["tune", scene_folder, scene_folder, "--ground-truth", truth, truth, "--out", out, *SHORT]
     grid = tune_words(scene_folder, truth, out)[10:]
-    fit = ("--plane.hypotheses", "32", "--plane.sample-points", "512")
+    fit = ("--labeller", "plane", "--plane.hypotheses", "32", "--plane.sample-points", "512")
     outcome = cli(*words, *grid, *fit)
     assert outcome.status == 0, outcome
     config, told = load_config(str(out)), json.loads(out.with_suffix(".json").read_text())
