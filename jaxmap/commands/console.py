@@ -16,6 +16,7 @@ from jaxmap.errors import UsageError
 Arguments = TypeVar("Arguments")
 
 SHORT = {"--relief": ("--relief.combine", "True"), "--no-relief": ("--relief.combine", "False")}
+"""Short names of options with their value."""
 
 
 def parse(

@@ -162,7 +162,7 @@ def test_all_faults_of_a_class_map_are_named_together():
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (dict(size_px=(0, 32)), "deeplab.size_px.0 is 0: input should be greater"),
+        (dict(size_px=(0, 32)), "deeplab.size_px.0 is 0: input should be greater than or equal to 1"),
         (dict(temperature=0.0), "deeplab.temperature is 0.0: input should be greater than 0"),
         (dict(temperature=float("nan")), "deeplab.temperature is nan"),
         (dict(classes=()), "the map has no class at all"),
