@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -33,15 +33,9 @@ from jaxmap.report.page import (
     table,
     write_page,
 )
+from jaxmap.report.score_tables import map_score_section, pose_score_section
 from jaxmap.report.voxel_view import voxel_view
-from jaxmap.report.wording import (
-    MISSED_COLUMNS,
-    SCORE_COLUMNS,
-    name_and_unit,
-    number_text,
-    share_text,
-    value_text,
-)
+from jaxmap.report.wording import name_and_unit, number_text, share_text, value_text
 from jaxmap.types import VoxelMap
 
 MAX_KEY_FRAMES = 12
@@ -59,6 +53,7 @@ _FILES = {
     "metrics.json": "all numbers of this page",
     "config.yaml": "the configuration",
     "scores.json": "scores against ground truth",
+    "pose_scores.json": "errors of the poses",
     "errors.png": "where map and ground truth differ, picture",
 }
 _GROUPS = ("camera", "grid", "times", "points", "voxels", "ensemble", "memory", "sequence")
@@ -163,7 +158,8 @@ def write_report(run: Path) -> Path:
         _header(contents),
         section("Top-down map", paper(path / "bev.png", f"Top-down map of {contents.name}", remarks)),
         missed_section(path, metrics, remarks),
-        _score_section(path, remarks),
+        map_score_section(path, remarks),
+        pose_score_section(path, remarks),
         in_3d(contents),
         section("Key frames", _key_frames(contents)),
         section("Metrics", _metric_tables(contents)),
@@ -238,53 +234,6 @@ def missed_section(path: Path, metrics: dict[str, Any], remarks: list[str]) -> s
         f"beside {area['called']} called so."
     )
     return section("What may be missed", f"<p>{text}</p>{image}" if image else "")
-
-
-def _score_section(run: Path, remarks: list[str]) -> str:
-    """Scores and error map that `jaxmap evaluate` left in a run folder."""
-    if not (run / "scores.json").is_file():
-        return ""
-    try:
-        text = _scores(read_json(run / "scores.json"))
-    except (JaxmapError, ValueError, KeyError, TypeError, AttributeError):
-        remarks.append("scores.json could not be read: the scores are left out.")
-        return ""
-    image = paper(run / "errors.png", "Rock that was found, falsely called and missed", remarks)
-    return section("Against ground truth", text + image)
-
-
-def _scores(scores: dict[str, Any]) -> str:
-    def listed(title: str, columns: Iterable[tuple[str, str]], rows: Iterable[tuple[str, dict[str, Any]]]) -> str:
-        keys, headings = zip(*columns, strict=True)
-        cells = [(escape(name), *(value_text(values.get(key)) for key in keys)) for name, values in rows]
-        return f'<div class="tables"><figure>{table((title, *headings), cells)}</figure></div>'
-
-    rocks = scores.get("rocks") or {}
-    facts = {"cells": scores.get("cells"), "frames": scores.get("frames")}
-    facts |= {"rocks in view": rocks.get("count"), "of them missed": rocks.get("missed")}
-    size, reach = scores.get("cell_size_m"), scores.get("max_range_m")
-    within = f", within {value_text(reach, 'm')}" if reach is not None else ""
-    counted = ", ".join(f"{value_text(value)} {name}" for name, value in facts.items() if value is not None)
-    rows = [("observed cells", scores), ("all cells in view", scores["in_view"])]
-    if "registration" in scores:
-        rows.append(("observed, before registration", scores["registration"]["before"]))
-    html = (
-        f"<p>Scored for {escape(str(scores.get('class')))} in cells of {value_text(size, 'm')}{within}: {counted}.</p>"
-        + listed("Counted", SCORE_COLUMNS.items(), rows)
-    )
-    if "ensemble" in scores:
-        ensemble = scores["ensemble"]
-        bins = [(f"{number_text(row['from'])} to {number_text(row['to'])}", row) for row in ensemble["reliability"]]
-        html += (
-            f"<p>Of {value_text(ensemble['cells'])} cells that the map does not call so, "
-            f"{value_text(ensemble['missed_cells'])} are; the ensemble expected "
-            f"{value_text(float(ensemble['expected_missed_cells']))}.</p>"
-        )
-        ranked = [("the ensemble", ensemble), ("the map alone", ensemble["map_alone"])]
-        html += listed("Missed cells, by", MISSED_COLUMNS.items(), ranked)
-        columns = {"cells": "cells", "said": "mean", "true": "truly missed"}
-        html += listed("Probability of a miss", columns.items(), bins)
-    return html
 
 
 def in_3d(contents: RunContents) -> str:

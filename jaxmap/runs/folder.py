@@ -52,6 +52,7 @@ class RunFolder:
         self.poses = path / "poses.tum"
         self.scores = path / "scores.json"
         self.errors = path / "errors.png"
+        self.pose_scores = path / "pose_scores.json"
         self.pictures = path / "pictures"
         self.profile = path / "profile"
         self._replacement = Replacement(path, self._outputs)
@@ -117,7 +118,7 @@ class RunFolder:
     def _files(self) -> tuple[Path, ...]:
         report = self.path / "report.html"
         # Scores are of the map that is there: they go with it.
-        scored = (self.scores, self.errors)
+        scored = (self.scores, self.errors, self.pose_scores)
         derived = (self.ply, self.geotiff, self.picture, self.missed)
         return (*derived, self.metrics, self.poses, report, self.config, *scored)
 
