@@ -33,7 +33,9 @@ from jaxmap.runs.log import RunLog
 from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.types import VoxelMap
 
-_PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.png")
+_PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.(png|webp)")
+_SMALL_PX = 640
+"""Width of the pictures of most key frames: a page holds two dozen of them."""
 
 
 class RunFolder:
@@ -176,7 +178,7 @@ class RunFolder:
     def _outputs(self) -> Iterator[Path]:
         """What an earlier run has written, and nothing else."""
         yield from (self.map, *stray_maps(self.map), self.profile, *self._files)
-        for picture in self.pictures.glob("*.png"):
+        for picture in self.pictures.glob("*"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 yield picture
 
@@ -199,18 +201,30 @@ def write_poses(
 
 
 def write_key_frame(
-    folder: RunFolder, index: int, rectified: RectifiedFrame, labels: np.ndarray | None, classes: tuple[str, ...]
+    folder: RunFolder,
+    index: int,
+    rectified: RectifiedFrame,
+    labels: np.ndarray | None,
+    classes: tuple[str, ...],
+    *,
+    large: bool,
 ) -> None:
-    """Writes the pictures of one frame: left image, disparity and, where there are any, labels."""
+    """Writes the pictures of one frame, left image, disparity and, where there are any, labels: large ones as PNG of
+    the image's own size, others as small WebP.
+    """
     from PIL import Image
 
     pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
     for kind, picture in pictures.items():
-        with atomic_path(folder.pictures / f"{index:06d}_{kind}.png") as temporary:
+        image, ending, effort = Image.fromarray(picture), "png", dict(compress_level=1)
+        if not large:
+            image.thumbnail((_SMALL_PX, _SMALL_PX))
+            ending, effort = "webp", dict(quality=80)
+        with atomic_path(folder.pictures / f"{index:06d}_{kind}.{ending}") as temporary:
             # Noise does not compress: more effort takes four times as long and saves little.
-            Image.fromarray(picture).save(temporary, compress_level=1)
+            image.save(temporary, **effort)
 
 
 EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.png"}

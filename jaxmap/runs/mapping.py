@@ -24,6 +24,8 @@ from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Notify, Plan
 from jaxmap.types import VoxelMap
 
+_PICTURES_AT_ONCE = 4
+"""Frames that wait for their pictures to be written; each holds some 10 MB."""
 FEW_MATCHED = 0.01
 """Where fewer pixels of a frame have a depth in range, it is not the bounds that leave a map empty."""
 
@@ -90,6 +92,10 @@ def run_plan(
                 # Pictures wait for the next save; noted before the frame counts, so that an interrupt loses none.
                 key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             log.add(fused, _disparity_scores(plan, fused))
+            if len(key_frames) >= _PICTURES_AT_ONCE:
+                started_s = time.perf_counter()
+                _write_key_frames(plan, folder, key_frames)
+                resumed_s += time.perf_counter() - started_s
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
@@ -254,7 +260,8 @@ def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[Prep
         labels = None
         if plan.labeller.classes:
             labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
-        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
+        large = plan.key_frames[prepared.index]
+        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
     key_frames.clear()
 
 
@@ -290,8 +297,9 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             # Poses of the rectified camera, relative to the site origin.
             "key_frames": {
                 f"{index:06d}": (sequence.T_world_camera[index] @ plan.front_end.T_raw_rectified).round(6).tolist()
-                for index in sorted(plan.key_frames)
+                for index in plan.key_frames
             },
+            "T_raw_rectified": plan.front_end.T_raw_rectified.round(9).tolist(),
         },
         "grid": {
             "shape": list(grid.shape),

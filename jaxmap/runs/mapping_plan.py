@@ -237,7 +237,8 @@ def _with_relief(labeller: Labeller, config: MapConfig, *, by_default: bool) -> 
 
 Notify = Callable[[str], None]
 
-_KEY_FRAMES = 4
+_KEY_FRAMES, _LARGE_EVERY = 22, 7
+"""Frames whose pictures are kept, evenly spaced, and which of them at full size: the first, the last, two between."""
 
 
 @dataclass(frozen=True)
@@ -273,9 +274,12 @@ class Plan:
         return frame_form(self.front_end.camera, self.labeller, self.members)
 
     @property
-    def key_frames(self) -> set[int]:
-        """Indices of the frames whose pictures are kept."""
-        return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
+    def key_frames(self) -> dict[int, bool]:
+        """The frames whose pictures are kept, by their index, and whether at full size."""
+        spaced = np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES).round().astype(int).tolist()
+        # Of frames taken twice, in a short sequence, the large one counts.
+        small = dict.fromkeys(spaced, False)
+        return dict(sorted((small | dict.fromkeys(spaced[::_LARGE_EVERY], True)).items()))
 
     @property
     def images(self) -> Iterator[Path]:
