@@ -209,8 +209,9 @@ def write_key_frame(
     *,
     large: bool,
 ) -> None:
-    """Writes the pictures of one frame, left image, disparity and, where there are any, labels: large ones as PNG of
-    the image's own size, others as small WebP.
+    """Writes the pictures of one frame: left image, disparity and, where there are any, labels.
+
+    Large ones are PNG of the image's own size, others small WebP.
     """
     from PIL import Image
 
