@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +18,7 @@ from jaxmap.runs.config import MapConfig, load_config
 
 OUTPUTS = (
     *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
-    *("config.yaml", "poses.tum", "pictures/"),
+    *("config.yaml", "poses.tum", "frames.csv", "pictures/"),
 )
 
 
@@ -26,7 +27,7 @@ class MapArguments:
     """Map a stereo sequence: images and poses in, a voxel map and its pictures out.
 
     Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
-    poses.tum, pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and
+    poses.tum, frames.csv, pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and
     bev.tif: the probability of a missed rock.
     """
 
@@ -45,6 +46,10 @@ class MapArguments:
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
     TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
+    view: bool = False
+    """Show the run in the viewer of rerun while it goes on (pip install 'jaxmap[view]')."""
+    view_save: Path | None = None
+    """Write what --view shows into this .rrd file, and open no window."""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
 
 
@@ -58,10 +63,15 @@ def main(words: Sequence[str]) -> int:
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.report.recording import check_viewer
     from jaxmap.runs.folder import RunFolder
-    from jaxmap.runs.mapping import run_plan
+    from jaxmap.runs.mapping import run_plan, unwatched
     from jaxmap.runs.mapping_plan import plan_run
+    from jaxmap.runs.viewing import live_view
 
+    watched = arguments.view or arguments.view_save is not None
+    if watched:
+        check_viewer(arguments.view_save)
     keep_compiled_programs(scopes=arguments.profile)
     # SIGTERM, which ends jobs of clusters and services, counts as Ctrl-C: the map is saved first.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -74,6 +84,7 @@ def main(words: Sequence[str]) -> int:
     with (
         folder.locked(),
         folder.writing(plan.settings(config), resume=resume, overwrite=overwrite) as work,
+        live_view(plan, arguments.view_save) if watched else nullcontext(unwatched) as watch,
         console.progress("mapping", len(plan.sequence.frames)) as advance,
     ):
         metrics = run_plan(
@@ -83,6 +94,7 @@ def main(words: Sequence[str]) -> int:
             checkpoint_every_s=arguments.checkpoint_every_s,
             notify=console.notify,
             on_frame=advance,
+            watch=watch,
             profile=arguments.profile,
         )
     console.notify(summary(metrics))
@@ -90,6 +102,8 @@ def main(words: Sequence[str]) -> int:
         console.notify(f"skipped {skipped['frame']}: {skipped['reason']}")
     missed, profile = ["missed.png"] if config.ensemble.members else [], ["profile/"] if arguments.profile else []
     console.result(arguments.out, (*OUTPUTS, *missed, *profile))
+    if arguments.view_save is not None:
+        console.result(arguments.view_save.parent, [arguments.view_save.name])
     return 0
 
 

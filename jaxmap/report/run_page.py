@@ -26,6 +26,7 @@ _FILES = {
     "bev.png": "top-down map, picture",
     "missed.png": "where the map may have missed something, picture",
     "poses.tum": "poses of the left camera",
+    "frames.csv": "what became of each frame",
     "metrics.json": "all numbers of this page",
     "config.yaml": "the configuration",
     "scores.json": "scores against ground truth",

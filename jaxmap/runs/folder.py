@@ -52,6 +52,7 @@ class RunFolder:
         self.metrics = path / "metrics.json"
         self.config = path / "config.yaml"
         self.poses = path / "poses.tum"
+        self.frames = path / "frames.csv"
         self.scores = path / "scores.json"
         self.errors = path / "errors.png"
         self.pose_scores = path / "pose_scores.json"
@@ -122,7 +123,7 @@ class RunFolder:
         # Scores are of the map that is there: they go with it.
         scored = (self.scores, self.errors, self.pose_scores)
         derived = (self.ply, self.geotiff, self.picture, self.missed)
-        return (*derived, self.metrics, self.poses, report, self.config, *scored)
+        return (*derived, self.metrics, self.poses, self.frames, report, self.config, *scored)
 
     def check_apart(self, source: str, images: Iterable[Path], inputs: Iterable[Path | None]) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
@@ -219,7 +220,8 @@ def write_key_frame(
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
     for kind, picture in pictures.items():
-        image, ending, effort = Image.fromarray(picture), "png", dict(compress_level=1)
+        image, ending = Image.fromarray(picture), "png"
+        effort: dict[str, Any] = dict(compress_level=1)
         if not large:
             image.thumbnail((_SMALL_PX, _SMALL_PX))
             ending, effort = "webp", dict(quality=80)

@@ -22,12 +22,20 @@ from jaxmap.runs.checking import finding_line, findings_tree
 from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Notify, Plan
+from jaxmap.runs.run_frames import write_frame_table
 from jaxmap.types import VoxelMap
 
 _PICTURES_AT_ONCE = 4
 """Frames that wait for their pictures to be written; each holds some 10 MB."""
 FEW_MATCHED = 0.01
 """Where fewer pixels of a frame have a depth in range, it is not the bounds that leave a map empty."""
+
+Watch = Callable[[FusedFrame, VoxelMap], None]
+"""Looks at the map after each frame; the next frame takes the map's memory."""
+
+
+def unwatched(fused: FusedFrame, voxel_map: VoxelMap) -> None:
+    """Looks at nothing."""
 
 
 def run_plan(
@@ -38,6 +46,7 @@ def run_plan(
     checkpoint_every_s: float,
     notify: Notify,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
+    watch: Watch = unwatched,
     profile: bool = False,
     report: bool = True,
 ) -> dict[str, Any]:
@@ -53,6 +62,7 @@ def run_plan(
         checkpoint_every_s: how often the map is saved on the way.
         notify: takes lines for the user.
         on_frame: called after each frame.
+        watch: looks at the map after each frame (`viewing.live_view`).
         profile: record a trace of some steps into the folder, and report where their time went.
         report: write the page of the run.
 
@@ -99,6 +109,7 @@ def run_plan(
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
+            watch(fused, voxel_map)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 _save(plan, folder, log, voxel_map, key_frames)
@@ -189,12 +200,13 @@ def _write_outputs(
     """Writes all that a run leaves, and returns its metrics, the details among them."""
     attributes = _attributes(plan, log, voxel_map)
     save_map(folder.map, voxel_map, attributes)
-    skipped = {frame["frame"] for frame in log.skipped}
+    skipped = {frame["frame"]: frame["reason"] for frame in log.skipped}
     fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
+    write_frame_table(folder.frames, plan.sequence.frames, skipped)
     write_exports(folder, voxel_map, attributes)
     metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map) | details
     write_json(folder.metrics, metrics)
