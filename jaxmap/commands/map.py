@@ -26,9 +26,9 @@ OUTPUTS = (
 class MapArguments:
     """Map a stereo sequence: images and poses in, a voxel map and its pictures out.
 
-    Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
-    poses.tum, frames.csv, pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and
-    bev.tif: the probability of a missed rock.
+    Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml, poses.tum, frames.csv,
+    pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and bev.tif: the
+    probability of a missed rock.
     """
 
     sequence: tyro.conf.Positional[str]
