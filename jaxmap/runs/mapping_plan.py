@@ -23,7 +23,7 @@ from jaxmap.ensemble.draws import draw_ensemble
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
-from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
+from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, site_lattice, usable_depth
 from jaxmap.geometry.options import GridOptions, Triple
 from jaxmap.host.files import bundled, real_path
 from jaxmap.labellers.base import Labeller, make_no_labeller
@@ -45,55 +45,39 @@ from jaxmap.types import Frame, GridSpec, StereoCamera, make_grid
 BUNDLED_WIDTH_PX = 512
 """Width that the bundled network runs at: at twice that it takes four times as long for a hundredth of IoU."""
 
-DEFAULT_VOXELS_M: tuple[Triple, ...] = ((0.05, 0.05, 0.2), (0.1, 0.1, 0.2), (0.2, 0.2, 0.2))
-"""The voxels of a map whose settings name none, the finest that fits."""
+DEFAULT_VOXEL_M: Triple = (0.05, 0.05, 0.2)
+"""The voxels of a map whose settings name none."""
 
 
 def choose_grid(
-    config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float, class_count: int
+    settings: GridOptions, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float
 ) -> GridSpec:
-    """The grid that the settings ask for; voxels of no given size are as fine as the memory allows.
+    """The grid that the settings ask for, on the lattice of the site.
 
     Args:
-        config: the settings.
+        settings: the bounds and the voxels.
         sequence: whose views it must hold.
         front_end: of the sequence.
         max_depth_m: how far its views reach.
-        class_count: how many classes the map has.
 
     Raises:
         JaxmapError: the bounds do not make a box, or no camera sees it.
     """
-    if config.grid.voxel_size_m is not None:
-        return _grid_of(config.grid, config.grid.voxel_size_m, sequence, front_end, max_depth_m)
-    limit_bytes = config.grid.max_memory_gib * 2**30
-    *finer, coarsest_m = DEFAULT_VOXELS_M
-    for size_m in finer:
-        grid = _grid_of(config.grid, size_m, sequence, front_end, max_depth_m)
-        if map_bytes(grid, class_count, config.ensemble.members) <= limit_bytes:
-            return grid
-    return _grid_of(config.grid, coarsest_m, sequence, front_end, max_depth_m)
-
-
-def _grid_of(
-    settings: GridOptions,
-    voxel_size_m: float | Triple,
-    sequence: StereoSequence,
-    front_end: StereoFrontEnd,
-    max_depth_m: float,
-) -> GridSpec:
+    voxel_size_m = settings.voxel_size_m or DEFAULT_VOXEL_M
+    lattice_m = site_lattice(sequence.site_origin, voxel_size_m)
     views = grid_around_views(
         front_end.camera,
         sequence.T_world_camera @ front_end.T_raw_rectified,
         max_depth_m,
         voxel_size_m,
         (settings.below_camera_m, settings.above_camera_m),
+        lattice_m,
     )
     if (settings.lower_m is None) != (settings.upper_m is None):
         raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
     if settings.lower_m is None or settings.upper_m is None:
         return views
-    grid = make_grid(settings.lower_m, settings.upper_m, voxel_size_m)
+    grid = make_grid(settings.lower_m, settings.upper_m, voxel_size_m, lattice_m)
     lower, upper = _extent(views)
     if (np.array(settings.lower_m) >= upper).any() or (np.array(settings.upper_m) <= lower).any():
         raise UsageError(
@@ -328,7 +312,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame =
         labeller = choose_labeller(config, label_folder, network, front_end.camera)
         if model is not None and network is not None:
             notify(describe_network(model, network, labeller.classes))
-        grid = choose_grid(config, sequence, front_end, depth_range_m[1], len(labeller.classes))
+        grid = choose_grid(config.grid, sequence, front_end, depth_range_m[1])
         rule = config.fusion.rule(labeller.classes)
         fusion_params = make_fusion_params(labeller.classes, config.fusion)
         members = _members(config, rule, labeller.classes)
