@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_runs import add_cameras, make_run
 from PIL import Image
-from test_report import add_cameras, make_run
 
 from jaxmap.labels import ROVER_CLASSES, class_colours
 from jaxmap.report.run_page import write_report
