@@ -1,9 +1,9 @@
-"""Observations: what was seen in each frame, kept on disk, so that frames are matched and labelled once and fused often.
+"""Observations: what was seen in each frame, kept on disk: frames are matched and labelled once, and fused often.
 
 A Zarr v3 group: its attributes hold what all frames share, and a group of each frame's name its time and pose, the
 disparity in sixteenths of a pixel, and what labels are made from, at the resolution at which it was made. Relief, and
-whatever else a few numbers change, is computed when the frame is fused. A frame is written beside its place and renamed:
-it is there whole, or not at all, whoever is killed when.
+whatever else a few numbers change, is computed when the frame is fused. A frame is written beside its place and
+renamed: it is there whole, or not at all, whoever is killed when.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ class ObservationAttributes:
         dataset: of its reader.
         camera: the arguments of `make_stereo_camera`: the rectified camera.
         settings: those of the perception, resolved (`runs.config.PerceiveConfig`).
+        labeller: what gave labels.
         kept: what labels are made from; None where they are made of the points alone.
         kept_shape: of that array.
         classes: of what is kept, in its order.
@@ -97,6 +98,7 @@ class ObservationAttributes:
     dataset: str
     camera: dict[str, Number]
     settings: dict[str, Any]
+    labeller: str = "none"
     kept: Kept | None = None
     kept_shape: tuple[Count, ...] = ()
     classes: tuple[str, ...] = ()
@@ -344,7 +346,10 @@ class Observations:
     def frame_of(self, observation: Observation, index: int) -> Frame:
         """The frame that the step sees of an observation."""
         kept = self.attributes.kept
-        filled: dict[str, Any] = {} if kept is None else {kept: to_device(observation.kept)}
+        filled: dict[str, Any] = {}
+        if kept is not None:
+            assert observation.kept is not None
+            filled[kept] = to_device(observation.kept)
         pose = jaxlie.SE3.from_matrix(to_device(self.T_world_rectified[index], np.float32))
         return Frame(to_device(observation.disparity_px), pose, **filled)
 

@@ -25,8 +25,9 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    The images are empty where observations, which hold none, are read again. `too_near` is the share of pixels that were left out because they are nearer than the searched disparities reach,
-    and `nearest_px` the disparity of the nearest of them.
+    The images are empty where observations, which hold none, are read again. `too_near` is the share of pixels that
+    were left out because they are nearer than the searched disparities reach, and `nearest_px` the disparity of the
+    nearest of them.
     """
 
     left: np.ndarray

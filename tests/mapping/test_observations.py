@@ -1,4 +1,4 @@
-"""Observations on disk: what is kept is what was seen to within a rounding, a frame is whole or absent, damage is named."""
+"""Observations on disk: what is kept is what was seen, a frame is whole or absent, and damage is named."""
 
 from __future__ import annotations
 
