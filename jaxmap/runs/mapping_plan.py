@@ -145,7 +145,8 @@ class Plan(Perception):
             keep_in: the observations to be written on the way, with a keeper.
         """
         if self.observations is not None:
-            return observed_frames(self.observations, pose_errors=self.pose_errors, first=first)
+            more: Any = {"left_image": self.left_image, "pose_errors": self.pose_errors}
+            return observed_frames(self.observations, first=first, **more)
         if self.keeper is not None and keep_in is not None:
             return self.keeper.frames(keep_in, range(first, len(self.sequence.frames)), self.pose_errors)
         return prepare_frames(
@@ -179,6 +180,7 @@ def plan_run(
     on_frame: OnFrame = lambda done, total: None,
     *,
     keep: bool = False,
+    images: bool = False,
 ) -> Plan:
     """Opens the sequence or its observations, and decides range, bounds, labeller and step.
 
@@ -188,11 +190,12 @@ def plan_run(
         notify: takes lines for the user.
         on_frame: is told of the progress of odometry, where it gives the poses.
         keep: keep what is perceived, as observations.
+        images: of observations, too, let the labeller see the images (`plan_perception`).
 
     Raises:
         JaxmapError: the data or the settings do not serve.
     """
-    seen = plan_perception(source, config, notify, on_frame)
+    seen = plan_perception(source, config, notify, on_frame, images=images)
     keeper = None
     if keep:
         keeper = make_keeper(seen, config, config.fusion.disparity_sigma_px)
