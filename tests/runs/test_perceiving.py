@@ -80,6 +80,7 @@ def test_the_plan_and_the_frames_are_those_of_the_sequence(perceived, scene_fold
         jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("soft", [False, True])
 def test_labels_of_files_are_kept(soft, scene_copy, cli, tmp_path):
     labels = scene_copy / "labels"
@@ -109,6 +110,7 @@ def test_what_is_there_is_not_perceived_again(cli, copy, scene_folder):
     assert "nothing is left to do" in cli("perceive", scene_folder, "--out", copy, *PLANE).err
 
 
+@pytest.mark.slow
 def test_other_settings_poses_or_a_run_in_the_folder_are_refused(cli, copy, scene_copy, scene_folder, tmp_path):
     words = ("perceive", scene_folder, "--out", copy)
     outcome = cli(*words, *PLANE, "--stereo.block-size", "5")
@@ -125,6 +127,7 @@ def test_other_settings_poses_or_a_run_in_the_folder_are_refused(cli, copy, scen
     assert "the folder holds a run" in cli(*words, *PLANE).error
 
 
+@pytest.mark.slow
 def test_frames_that_cannot_be_used_are_told_and_left_out(cli, scene_copy, tmp_path):
     (scene_copy / "right" / f"{frame_name(2)}.png").write_bytes(b"no picture")
     outcome = cli("perceive", scene_copy, "--out", tmp_path / "obs", *PLANE)
@@ -135,6 +138,7 @@ def test_frames_that_cannot_be_used_are_told_and_left_out(cli, scene_copy, tmp_p
     assert cli("perceive", scene_copy, "--out", tmp_path / "strict", *PLANE, "--strict").status == 1
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_what_is_whole_and_the_next_run_goes_on(cli, scene_folder, tmp_path, monkeypatch):
     written, sync = [], store.sync
 
@@ -246,15 +250,16 @@ def test_a_map_of_observations_is_that_of_the_sequence(cli, perceived, scene_fol
 @pytest.mark.slow
 def test_a_network_sees_each_frame_once_and_tuned_numbers_still_act(cli, scene_folder, tmp_path):
     model = write_small_model(tmp_path / "model.safetensors")
-    words = ("--labeller", "deeplab", "--model", model, "--classes", "sand", "boulder", "--stop", 2)
+    network = ("--labeller", "deeplab")
+    words = (*network, "--model", model, "--classes", "sand", "boulder", "--stop", 2)
     assert cli(*map_words(scene_folder, tmp_path / "direct", *words)).status == 0
     assert cli(*map_words(scene_folder, tmp_path / "kept", *words, "--keep-observations")).status == 0
     model.unlink()
-    assert cli(*map_words(tmp_path / "kept", tmp_path / "fused")).status == 0
+    assert cli(*map_words(tmp_path / "kept", tmp_path / "fused", *network)).status == 0
     np.testing.assert_array_equal(log_odds(tmp_path / "fused"), log_odds(tmp_path / "kept"))
     np.testing.assert_allclose(log_odds(tmp_path / "fused"), log_odds(tmp_path / "direct"), atol=0.01)
-    softer = cli(*map_words(tmp_path / "kept", tmp_path / "softer", "--deeplab.temperature", 5))
+    softer = cli(*map_words(tmp_path / "kept", tmp_path / "softer", *network, "--deeplab.temperature", 5))
     assert softer.status == 0
     assert np.abs(log_odds(tmp_path / "softer") - log_odds(tmp_path / "fused")).max() > 0.05
-    refused = cli(*map_words(tmp_path / "kept", tmp_path / "refused", "--deeplab.size-px", 64, 64))
+    refused = cli(*map_words(tmp_path / "kept", tmp_path / "refused", *network, "--deeplab.size-px", 64, 64))
     assert "perceived with another deeplab.size_px" in refused.error
