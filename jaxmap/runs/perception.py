@@ -83,11 +83,10 @@ class Perception:
 
         With observations, those that have a picture.
         """
-        count = len(self.sequence.frames)
-        if self.observations is None:
-            spaced = np.linspace(0, count - 1, _KEY_FRAMES).round().astype(int).tolist()
-        else:
-            spaced = [index for index in range(count) if self.observations.picture(index) is not None]
+        there = list(range(len(self.sequence.frames)))
+        if self.observations is not None:
+            there = [index for index in there if self.observations.picture(index) is not None]
+        spaced = [there[int(place)] for place in np.linspace(0, len(there) - 1, _KEY_FRAMES).round()] if there else []
         # Of frames taken twice, in a short sequence, the large one counts.
         small = dict.fromkeys(spaced, False)
         return dict(sorted((small | dict.fromkeys(spaced[::_LARGE_EVERY], True)).items()))
