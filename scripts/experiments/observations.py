@@ -4,9 +4,9 @@
 
 Traverses are `sample:traverse` (the default) and folders that hold Part1 and gt. Each is perceived into a folder of its
 own, then mapped from its images and from what was kept. The table says what a frame takes on disk; the share of voxels
-seen that have the same label in both maps, and by how much accuracy and IoU of rock differ; the frames a second of both,
-their ratio, and the processor time of a frame of both; and what a frame takes to be read and unpacked (in one thread)
-and to be fused (the step). Times leave compiling out.
+seen that have the same label in both maps, and by how much accuracy and IoU of rock differ; the frames a second of
+both, their ratio, and the processor time of a frame of both; and what a frame takes to be read and unpacked (in one
+thread) and to be fused (the step). Times leave compiling out.
 """
 
 from __future__ import annotations
