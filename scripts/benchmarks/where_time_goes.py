@@ -44,7 +44,7 @@ def main() -> None:
     else:
         config = load_config(given.config) if given.config else MapConfig()
     config = replace(config, labeller=given.labeller, stop=given.frames)
-    plan = plan_run(given.sequence, config, str)
+    plan = plan_run(given.sequence, config, lambda line: None)
     prepared = list(plan.prepare())
     frames = [one.frame for one in prepared if one.frame is not None]
     voxel_map = plan.mapper.init()
