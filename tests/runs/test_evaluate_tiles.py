@@ -65,7 +65,7 @@ def test_a_map_in_one_piece_and_in_tiles_give_the_same_scores(cli, run, tmp_path
 @pytest.mark.slow
 @pytest.mark.parametrize("cell_size_m", [0.2, 0.25])
 def test_of_a_large_map_the_part_under_the_truth_is_scored(cli, run, tmp_path, monkeypatch, cell_size_m):
-    truth = truth_over(tmp_path, 12.8, 60)
+    truth = truth_over(tmp_path, 6.4, 40)
     words = ("--cell-size-m", cell_size_m)
     whole = scores_of(cli, run, truth, *words)
     monkeypatch.setattr(evaluation, "MOST_WHOLE", 0)
