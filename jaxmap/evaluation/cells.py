@@ -19,7 +19,7 @@ from jaxmap.geometry.grid import exact_corner
 from jaxmap.types import GridSpec
 
 if TYPE_CHECKING:
-    from scipy.sparse import sparray
+    from scipy.sparse import csr_array
 
 MAX_CELLS = 2**26
 _MOST_DENSE = 2**24
@@ -57,8 +57,8 @@ class ColumnShares(NamedTuple):
     part. Of many columns the matrices are sparse: a cell holds but a few.
     """
 
-    x: Float[np.ndarray, "I X"] | sparray
-    y: Float[np.ndarray, "J Y"] | sparray
+    x: Float[np.ndarray, "I X"] | csr_array
+    y: Float[np.ndarray, "J Y"] | csr_array
     columns_per_cell: float
 
 
@@ -137,7 +137,7 @@ def _sparse_shares(grid: GridSpec, cells: CellGrid) -> ColumnShares:
 def area_in_cells(shares: ColumnShares, columns: Float[AnyArray, "X Y"]) -> Float[Array, "I J"]:
     """The sum over the columns of each cell, weighted by the share of their area that lies in it."""
     if not isinstance(shares.x, np.ndarray):
-        return jnp.asarray((shares.x @ np.asarray(columns, np.float32)) @ shares.y.T)
+        return jnp.asarray(shares.x @ np.asarray(columns, np.float32) @ shares.y.T)
     # The default precision of accelerators would round the counts.
     along_x = jnp.matmul(shares.x, columns, precision="highest")
     return jnp.matmul(along_x, shares.y.T, precision="highest")

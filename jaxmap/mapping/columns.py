@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.neighbours import kernel_margin
@@ -62,7 +63,7 @@ def top_down_of(reader: MapReader, params: FusionParams, rule: FusionRule, withi
     shape = (within[0].stop - within[0].start, within[1].stop - within[1].start)
     check_columns(shape, 8 + 4 * len(reader.classes), "the top-down map")
     prior = np.asarray(jax.nn.sigmoid(params.class_prior))
-    whole = TopDown(
+    whole: dict[str, Any] = dict(
         probability=np.broadcast_to(prior[:, None, None], (len(reader.classes), *shape)).copy(),
         label=np.full(shape, IGNORE, np.uint8),
         height_m=np.full(shape, np.nan, np.float32),
@@ -70,9 +71,49 @@ def top_down_of(reader: MapReader, params: FusionParams, rule: FusionRule, withi
     )
     for top, place in top_down_blocks(reader, params, rule, within):
         here, there = overlap(place, within)
-        for part, values in zip(whole, top, strict=True):
-            part[(..., *there)] = values[(..., *here)]
-    return whole
+        for name, values in top._asdict().items():
+            whole[name][(..., *there)] = values[(..., *here)]
+    return TopDown(**whole)
+
+
+def log_odds_of(reader: MapReader, within: Columns) -> Float[np.ndarray, "K X Y Z"]:
+    """The evidence of a rectangle of columns, zeros where nothing was observed.
+
+    Raises:
+        JaxmapError: a tile is damaged, or no memory holds the columns.
+    """
+    shape = (within[0].stop - within[0].start, within[1].stop - within[1].start)
+    check_columns(shape, 4 * (1 + len(reader.classes)) * reader.grid.shape[2], "the map")
+    values = np.zeros((1 + len(reader.classes), *shape, reader.grid.shape[2]), np.float32)
+    for block in reader.blocks(0, within):
+        own = np.asarray(block.voxel_map.log_odds)[(slice(None), *block.own)]
+        place = tuple(slice(a, a + size) for a, size in zip(block.corner, own.shape[1:3], strict=True))
+        here, there = overlap((place[0], place[1]), within)
+        values[(slice(None), *there)] = own[(slice(None), *here)]
+    return values
+
+
+def nearest_observed(reader: MapReader, column: tuple[float, float]) -> tuple[int, int] | None:
+    """The column of which anything was observed that is nearest to a place, both counted in the grid; None of none."""
+
+    def apart(place: Columns) -> float:
+        return float(np.hypot(*(max(p.start - at, at - p.stop, 0) for p, at in zip(place, column, strict=True))))
+
+    best, nearest = np.inf, None
+    for place in sorted(reader.places, key=apart):
+        if apart(place) >= best:
+            break
+        columns = np.argwhere((log_odds_of(reader, place) != 0).any(axis=(0, 3))) + _corner(place)
+        if len(columns):
+            away = np.hypot(*(columns + 0.5 - column).T)
+            if away.min() < best:
+                best = float(away.min())
+                nearest = tuple(map(int, columns[away.argmin()]))
+    return None if nearest is None else (nearest[0], nearest[1])
+
+
+def _corner(place: Columns) -> Int[np.ndarray, "2"]:
+    return np.array([place[0].start, place[1].start])
 
 
 def check_columns(shape: tuple[int, int], number_bytes: float, what: str) -> None:
@@ -113,8 +154,7 @@ def _padded(block: Block, edge: tuple[int, int], margin: int) -> tuple[VoxelMap,
     voxel_map = block.voxel_map
     before = [margin - own.start for own in block.own]
     after = [
-        wanted + 2 * margin - size - low
-        for wanted, size, low in zip(edge, voxel_map.grid.shape, before, strict=False)
+        wanted + 2 * margin - size - low for wanted, size, low in zip(edge, voxel_map.grid.shape, before, strict=False)
     ]
     own = tuple(slice(own.start + low, own.stop + low) for own, low in zip(block.own, before, strict=True))
     if any(before) or any(after):

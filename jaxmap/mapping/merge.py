@@ -19,7 +19,11 @@ _FULL_VOXEL = 1e-3
 """Lattices that are less than this share of a voxel apart are one: they are stored in float32."""
 
 
-def common_grid(maps: Sequence[MapReader], names: Sequence[object]) -> tuple[GridSpec, list[Int[np.ndarray, "3"]]]:
+Shift = Int[np.ndarray, "3"]
+"""From the voxels of one lattice to those of another."""
+
+
+def common_grid(maps: Sequence[MapReader], names: Sequence[object]) -> tuple[GridSpec, list[Shift]]:
     """The grid that holds all maps, in whole tiles on the lattice of the first, about the first's site origin.
 
     Args:
@@ -40,7 +44,7 @@ def common_grid(maps: Sequence[MapReader], names: Sequence[object]) -> tuple[Gri
         shift = np.round(apart)
         if (np.abs(apart - shift) > _FULL_VOXEL).any():
             raise UsageError(
-                f"its lattice is {(apart - shift).round(3).tolist()} of a voxel off that of {names[0]}",
+                f"the lattice is {(apart - shift).round(3).tolist()} of a voxel off that of {names[0]}",
                 where=name,
                 fix="map one of the two again: maps of one CRS and voxel size then share their voxels",
             )
@@ -49,8 +53,8 @@ def common_grid(maps: Sequence[MapReader], names: Sequence[object]) -> tuple[Gri
     low, high = np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))
     if max(np.abs(low).max(), np.abs(high).max()) > MOST_VOXELS_ALONG - max(TILE):
         raise UsageError(
-            f"{np.abs([low, high]).max():.3g} voxels from the first site's origin, at most {MOST_VOXELS_ALONG:,} can be "
-            "told apart",
+            f"{np.abs([low, high]).max():.3g} voxels from the first site's origin, at most {MOST_VOXELS_ALONG:,} can "
+            "be told apart",
             where=names[0],
             fix="merge sessions of one site",
         )
@@ -76,17 +80,17 @@ def check_alike(maps: Sequence[MapReader], names: Sequence[object]) -> None:
                 for key in sorted(ours.fusion.keys() | theirs.fusion.keys())
             },
         }
-        apart = [f"{key} {a} and {b}" for key, (a, b) in pairs.items() if a != b]
+        apart = [f"{key} is {a}, not {b}" for key, (a, b) in pairs.items() if a != b]
         if apart:
             raise UsageError(
-                f"it differs from {names[0]}: {'; '.join(apart)}", where=name, fix="map the sessions with one setting"
+                f"not to be added to {names[0]}: {'; '.join(apart)}", where=name, fix="map all sessions alike"
             )
     seen: dict[str, object] = {}
     for one, name in zip(maps, names, strict=True):
         for digest in digests_of(one):
             if digest in seen:
                 raise UsageError(
-                    f"it holds the same frames as {seen[digest]}: they would count twice",
+                    f"frames of {seen[digest]} would count twice",
                     where=name,
                     fix="name each session once",
                 )

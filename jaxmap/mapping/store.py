@@ -157,8 +157,8 @@ class MapReader:
         frames_fused: how many frames it holds.
         attributes: what is stored beside it.
         places: where its blocks lie in the grid; what lies in none was not observed.
-        blocks: `(margin=0, within=None) -> Iterator[Block]`, blocks that together hold all that was observed, each column
-            once, with as many columns around them; only those that touch the columns `within`, where that is given.
+        blocks: `(margin=0, within=None) -> Iterator[Block]`, blocks that together hold all that was observed, each
+            column once, with as many columns around them; of those only the ones that touch the columns `within`.
     """
 
     grid: GridSpec
@@ -210,8 +210,8 @@ def open_map(path: str | os.PathLike[str]) -> MapReader:
 
     edge = array.chunks[1:3]
     places = tuple(
-        (slice(x * edge[0], min((x + 1) * edge[0], grid.shape[0])), slice(y * edge[1], min((y + 1) * edge[1], grid.shape[1])))
-        for x, y in sorted({(tile[1], tile[2]) for tile in stored_chunks(folder / LOG_ODDS)})
+        (slice(x, min(x + edge[0], grid.shape[0])), slice(y, min(y + edge[1], grid.shape[1])))
+        for x, y in sorted({(tile[1] * edge[0], tile[2] * edge[1]) for tile in stored_chunks(folder / LOG_ODDS)})
     )
 
     def blocks(margin: int = 0, within: Columns | None = None) -> Iterator[Block]:

@@ -120,7 +120,7 @@ def class_layer_of(
         site_origin: where the origin of the map's world lies in `crs`, metres.
         crs: coordinate reference system of the site, or None.
     """
-    top = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
+    top = top_down(voxel_map, params, rule)
     return _class_layer(top, voxel_map.grid, voxel_map.classes, params, target, site_origin, crs)
 
 
@@ -133,13 +133,13 @@ def _class_layer(
     site_origin: Float64[np.ndarray, "3"],
     crs: str | None,
 ) -> ClassLayer:
-    index = classes.index(target)
+    index, observed = classes.index(target), np.asarray(top.observed)
     return ClassLayer(
         grid=grid,
-        is_class=(top.label == index) & top.observed,
-        probability=top.probability[index],
-        observed=top.observed,
-        height_m=top.height_m,
+        is_class=(np.asarray(top.label) == index) & observed,
+        probability=np.asarray(top.probability[index]),
+        observed=observed,
+        height_m=np.asarray(top.height_m),
         prior=float(jax.nn.sigmoid(params.class_prior[index])),
         site_origin=site_origin,
         crs=crs,
@@ -218,13 +218,9 @@ def evaluate_run(
         raise JaxmapError(
             f"--max-range-m needs poses.tum and metrics.json of the run: {remark}", where=run, fix="map again"
         )
+    raster = read_truth(sources, place_of(grid, site_origin, attributes.crs), truth_options)
     within = slice(0, grid.shape[0]), slice(0, grid.shape[1])
-    large = grid.shape[0] * grid.shape[1] > MOST_WHOLE
-    if large:
-        within = scored.reader.extent()
-    place = place_of(part_of(grid, within), site_origin, attributes.crs)
-    raster = read_truth(sources, place, truth_options)
-    if large:
+    if grid.shape[0] * grid.shape[1] > MOST_WHOLE:
         within = _columns_under(raster, grid, within, attributes)
     layer = scored.layer(within)
     evaluation = evaluate_map(layer, raster, cameras, options)

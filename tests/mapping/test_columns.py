@@ -60,4 +60,4 @@ def test_the_grid_of_a_part_lies_where_it_was():
     grid = patchy_map().grid
     part = part_of(grid, (slice(5, 9), slice(7, 10)))
     assert part.shape == (4, 3, grid.shape[2])
-    np.testing.assert_array_equal(part.first, np.asarray(grid.first) + [5, 7, 0])
+    np.testing.assert_array_equal(part.first, np.add(grid.first, [5, 7, 0]))
