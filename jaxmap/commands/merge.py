@@ -47,7 +47,7 @@ def main(words: Sequence[str]) -> int:
     folder, blocks = RunFolder(arguments.out), sum(len(session.reader.places) for session in sessions)
     with (
         folder.locked(),
-        folder.writing(settings_of(sessions), resume=False, overwrite=arguments.overwrite) as work,
+        folder.writing(settings_of(sessions), resume=None, overwrite=arguments.overwrite) as work,
         console.steps("merging", "blocks", blocks) as advance,
     ):
         notes = merge_sessions(sessions, work, advance)

@@ -30,7 +30,7 @@ class FramePart:
     Attributes:
         index: of the frame in its sequence.
         name: of the frame.
-        evidence: log-odds, summed over the voxels that decide: occupancy, then each class.
+        evidence: log-odds, summed over the voxels that decide and the mean of the columns: occupancy, then each class.
         seen_through: voxels of the place that it saw through.
         range_m: from the camera to the place.
         centre_px: column and row of the place in the image; None behind the camera.
@@ -70,13 +70,13 @@ class Explanation:
         high_m: north-east corner.
         crs: the system.
         classes: of the map.
-        columns: how many columns of voxels.
+        columns: how many columns of voxels were observed.
         labels: how many of them have each label.
         height_m: of the surface, None where nothing is occupied.
         evidence: what the map holds, as `FramePart.evidence`.
         priors: log-odds of occupancy and of each class where nothing was seen.
         probability: of each class, the mean of the columns; empty where nothing is occupied.
-        threshold: the probability from which a priority class wins.
+        priority: classes that win from a probability on, and that.
         spread: the map is read with a kernel, through which neighbours count too.
         column_rule: how a column reads its voxels: their sum, or the greatest.
         parts: the frames, in their order.
@@ -93,7 +93,7 @@ class Explanation:
     evidence: Float[np.ndarray, "K"]
     priors: Float[np.ndarray, "K"]
     probability: tuple[float, ...]
-    threshold: float
+    priority: tuple[tuple[str, ...], float]
     spread: bool
     column_rule: str
     parts: Sequence[FramePart]
@@ -121,7 +121,11 @@ class Explanation:
         """How the numbers are to be read."""
         of = {"sum": "summed over the occupied voxels", "max": "of the occupied voxel with the greatest evidence"}
         which = of[self.column_rule] if self.labels else "summed over the voxels that were observed"
-        text = f"Log-odds that each frame added, {which}; their sum and the prior are what the map holds."
+        mean = f", the mean of {self.columns} columns" if self.columns > 1 else ""
+        text = f"Log-odds that each frame added, {which}{mean}; their sum and the prior are what the map holds."
+        names, threshold = self.priority
+        if names and self.labels:
+            text += f" {' and '.join(names)} wins where its probability passes {threshold:.2g}."
         return text + (" Neighbouring columns count too, by the class kernel." if self.spread else "")
 
 
@@ -141,7 +145,8 @@ def write_explanation(path: Path, explained: Explanation) -> Path:
         ("pixels", value_text(int(sum(part.inside.sum() for part in explained.parts)))),
         ("height", value_text(round(explained.height_m, 2), "m") if explained.height_m is not None else None),
     ]
-    where = " · ".join(filter(None, [explained.place, explained.crs, f"{explained.columns} columns of voxels"]))
+    columns = f"{explained.columns} columns of voxels" if explained.columns > 1 else ""
+    where = " · ".join(filter(None, [explained.place, explained.crs, columns]))
     chosen = sorted(explained.parts, key=lambda part: -float(np.abs(part.evidence).max()))[:MOST_PATCHES]
     shown = [part for part in explained.parts if any(part is one for one in chosen)]
     left_out = len(explained.parts) - len(shown)
@@ -159,8 +164,8 @@ def write_explanation(path: Path, explained: Explanation) -> Path:
 
 def _charts(explained: Explanation) -> str:
     """How the evidence grew with the frames: the probability of each class, and of occupancy."""
-    numbers = [part.index for part in explained.parts]
-    sums = explained.priors + np.cumsum([part.evidence for part in explained.parts], axis=0)
+    numbers = range(len(explained.parts) + 1)
+    sums = np.cumsum([explained.priors, *(part.evidence for part in explained.parts)], axis=0)
     inks = [hex_of(ink) for ink in class_inks(explained.classes, LIGHT_PANEL)]
     variables = {ink: f"--class-{index}" for index, ink in enumerate(inks)}
     lines = [
@@ -174,7 +179,11 @@ def _charts(explained: Explanation) -> str:
     figures = ""
     for name, drawn in charts:
         svg = line_chart(
-            f"{name}: log-odds after each frame", ("frame", "log-odds"), drawn, height_px=240, variables=variables
+            f"{name}: log-odds after each frame",
+            ("frames that saw it", "log-odds"),
+            drawn,
+            height_px=240,
+            variables=variables,
         )
         figures += f"<figure><figcaption>{name}</figcaption>{svg}</figure>"
     return f'<div class="charts">{figures}</div>'

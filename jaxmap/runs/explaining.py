@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from jaxmap.mapping.explain import Contribution, make_explainer
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames
 from jaxmap.mapping.store import Columns, MapReader, open_map
 from jaxmap.report.explain_page import Explanation, FramePart
-from jaxmap.runs.config import check_config
+from jaxmap.runs.config import load_config
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.types import VoxelMap, pinhole, to_device
@@ -52,6 +53,15 @@ class Cell:
     deciding: Bool[np.ndarray, "K X Y Z"]
     params: FusionParams
     rule: FusionRule
+
+    @property
+    def columns(self) -> int:
+        """How many of its columns were observed."""
+        return int(self.deciding[0].any(axis=-1).sum())
+
+    def read(self, log_odds: Float[np.ndarray, "K X Y Z"]) -> Float[np.ndarray, "K"]:
+        """Evidence as the top-down map reads it, the mean of the columns."""
+        return np.where(self.deciding, log_odds, 0.0).sum(axis=(1, 2, 3), dtype=np.float64) / self.columns
 
 
 def find_cell(run: Path, at: tuple[float, float], radius_m: float | None = None) -> Cell:
@@ -133,12 +143,13 @@ def plan_again(run: Path, cell: Cell, notify: Notify) -> Plan:
     source = tree.get("sequence")
     if not isinstance(source, str):
         raise JaxmapError("it does not say which sequence was mapped", where=folder.config, fix="map it again")
-    plan = plan_run(source, check_config(tree, folder.config), notify, in_tiles=True)
+    plan = plan_run(source, load_config(str(folder.config)), notify, in_tiles=True)
     progress = cell.reader.attributes.progress
     done = progress.get("next_index")
     if not isinstance(done, int) or progress.get("digest") != plan.digest(done):
         raise JaxmapError("the frames, poses or camera are not those of the run", where=source, fix="map it again")
-    if plan.fusion != cell.reader.attributes.fusion or plan.labeller.classes != cell.reader.classes:
+    fusion = json.loads(json.dumps(plan.fusion))
+    if fusion != cell.reader.attributes.fusion or plan.labeller.classes != cell.reader.classes:
         raise JaxmapError(
             "the map was fused with other numbers than its config.yaml has", where=run, fix="map it again"
         )
@@ -213,7 +224,7 @@ def _part(cell: Cell, plan: Plan, index: int, prepared: PreparedFrame, added: Co
     return FramePart(
         index=index,
         name=prepared.ref.name,
-        evidence=np.where(cell.deciding, evidence, 0.0).sum(axis=(1, 2, 3), dtype=np.float64),
+        evidence=cell.read(evidence),
         seen_through=int((evidence[0] < 0).sum()),
         range_m=float(np.linalg.norm([x, y, z])),
         centre_px=(camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px) if z > 0 else None,
@@ -239,7 +250,7 @@ def _explanation(run: Path, cell: Cell, parts: list[FramePart]) -> Explanation:
     low = np.asarray(reader.attributes.site_origin, np.float64)[:2] + corner_m[:2]
     seen = cell.top.observed
     labels = [reader.classes[label] if label < len(reader.classes) else "no label" for label in cell.top.label[seen]]
-    read = np.where(cell.deciding, cell.log_odds, 0.0).sum(axis=(1, 2, 3), dtype=np.float64)
+    priority = tuple(reader.classes[index] for index in cell.rule.priority(reader.classes))
     priors = np.concatenate([[float(cell.params.occupancy_prior)], np.asarray(cell.params.class_prior, np.float64)])
     return Explanation(
         run=str(RunFolder(run).path.resolve().name),
@@ -247,13 +258,13 @@ def _explanation(run: Path, cell: Cell, parts: list[FramePart]) -> Explanation:
         high_m=(float(low[0] + size_m[0] * seen.shape[0]), float(low[1] + size_m[1] * seen.shape[1])),
         crs=reader.attributes.crs,
         classes=reader.classes,
-        columns=int(seen.size),
+        columns=cell.columns,
         labels={name: labels.count(name) for name in dict.fromkeys(labels)},
         height_m=float(np.nanmean(cell.top.height_m) + reader.attributes.site_origin[2]) if seen.any() else None,
-        evidence=read,
+        evidence=cell.read(cell.log_odds),
         priors=priors,
         probability=tuple(float(p) for p in cell.top.probability[:, seen].mean(axis=1)) if seen.any() else (),
-        threshold=float(cell.params.class_threshold),
+        priority=(priority, float(cell.params.class_threshold)),
         spread=cell.params.class_kernel is not None,
         column_rule=cell.rule.column,
         parts=parts,

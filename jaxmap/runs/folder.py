@@ -60,7 +60,7 @@ class RunFolder:
         return locked(self.path)
 
     @contextmanager
-    def writing(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> Iterator[RunFolder]:
+    def writing(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> Iterator[RunFolder]:
         """Begins a run and yields the folder it is to write into, see `begin`.
 
         A run that is replaced stays until the block has ended without an error.
@@ -72,8 +72,13 @@ class RunFolder:
         with self._replacement.written(keep=lambda: holds_map(work.map)):
             yield work
 
-    def begin(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
+    def begin(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> RunFolder:
         """Writes the resolved settings (`Plan.settings`), or checks that the run here can be resumed with them.
+
+        Args:
+            settings: as plain values.
+            resume: go on with what is there; None for work that cannot be resumed.
+            overwrite: replace what is there.
 
         Returns:
             Where to write: here, or where a run is replaced, a folder within.
@@ -94,7 +99,7 @@ class RunFolder:
             raise JaxmapError(
                 "the folder holds a run already",
                 where=self.path,
-                fix="resume it (--resume), replace it (--overwrite), or choose another folder",
+                fix=f"{'' if resume is None else 'resume it (--resume), '}replace it (--overwrite), or choose another folder",
             )
         self._check_own()
         self._replacement.discard()
@@ -114,11 +119,11 @@ class RunFolder:
 
     @property
     def _files(self) -> tuple[Path, ...]:
-        report = self.path / "report.html"
+        pages = (self.path / "report.html", self.path / "explain.html")
         # Scores are of the map that is there: they go with it.
         scored = (self.scores, self.errors)
         derived = (self.ply, self.geotiff, self.picture, self.missed)
-        return (*derived, self.metrics, self.poses, report, self.config, *scored)
+        return (*derived, self.metrics, self.poses, *pages, self.config, *scored)
 
     def check_apart(self, source: str, images: Iterable[Path], inputs: Iterable[Path | None]) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
