@@ -96,10 +96,11 @@ class RunFolder:
             check_same_settings(work.config, dict(settings))
             return work
         if not overwrite and (used or holds_map(replacing.map)):
+            going_on = "" if resume is None else "resume it (--resume), "
             raise JaxmapError(
                 "the folder holds a run already",
                 where=self.path,
-                fix=f"{'' if resume is None else 'resume it (--resume), '}replace it (--overwrite), or choose another folder",
+                fix=f"{going_on}replace it (--overwrite), or choose another folder",
             )
         self._check_own()
         self._replacement.discard()
