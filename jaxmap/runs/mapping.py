@@ -15,11 +15,12 @@ from jaxmap.evaluation.geometry_scores import DisparityScores, score_disparity
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
-from jaxmap.mapping.store import MapAttributes, save_map
+from jaxmap.mapping.store import MapAttributes, in_memory, save_map
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.checking import finding_line, findings_tree
-from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
+from jaxmap.runs.exports import write_exports
+from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_key_frame, write_poses
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Notify, Plan
 from jaxmap.types import VoxelMap
@@ -189,7 +190,7 @@ def _write_outputs(
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
-    write_exports(folder, voxel_map, attributes)
+    write_exports(folder, in_memory(voxel_map, attributes))
     metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map) | details
     write_json(folder.metrics, metrics)
     return metrics
