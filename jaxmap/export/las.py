@@ -44,7 +44,7 @@ def write_las(source: Source, path: Path) -> None:
         lookup = laspy.vlrs.known.ClassificationLookupVlr()
         for index, name in enumerate(source.classes):
             # The record has fifteen bytes for a name.
-            lookup.add_lookup(FIRST_CLASS + index, name.encode("ascii", "replace")[:15].decode())
+            lookup[FIRST_CLASS + index] = name.encode("ascii", "replace")[:15].decode()
         header.vlrs.append(lookup)
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         compressed = path.suffix == ".laz"

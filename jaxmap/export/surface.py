@@ -1,6 +1,7 @@
 """The top-down surface as triangles with coloured corners: a height field, which looks as the ground does.
 
-An isosurface of the voxels would show the layers of their noise from below; the rover saw the ground from above.
+An isosurface of the voxels would show their noise as layers and holes; the rover saw the ground from above. Steps of the
+voxels are smoothed, but the surface stays within the voxel that it was seen in.
 """
 
 from __future__ import annotations
@@ -9,9 +10,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxmap.export.source import Columns, Source
+from jaxmap.export.source import SURFACE, Columns, Source
+
+_SIGMA, _REACH = 2.0, 6
+"""Of the smoothing, in columns."""
 
 
 class Patch(NamedTuple):
@@ -33,14 +37,15 @@ def patches(source: Source) -> Iterator[Patch]:
 
     Corners on the edge of two blocks are in both.
     """
-    for columns in source.columns(margin=1):
+    for columns in source.columns(margin=_REACH + 1):
         patch = _patch(source, columns)
         if len(patch.triangles):
             yield patch
 
 
 def _patch(source: Source, columns: Columns) -> Patch:
-    height_m, observed = columns.height_m, np.asarray(columns.top.observed)
+    observed = np.asarray(columns.top.observed)
+    height_m = columns.height_m if SURFACE in columns.layers else _smooth(columns.height_m, observed, source.size_m[2])
     number = np.arange(observed.size).reshape(observed.shape)
     quads = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
     known = observed.ravel()[quads]
@@ -66,3 +71,21 @@ def _patch(source: Source, columns: Columns) -> Patch:
     points = np.column_stack([source.corner_m[:2] + place * source.size_m[:2], height_m[x, y]])
     label = np.asarray(columns.top.label)[x, y]
     return Patch(points, source.colours_of(points, label), compact.reshape(-1, 3).astype(np.int64))
+
+
+def _smooth(
+    height_m: Float[np.ndarray, "X Y"], observed: Bool[np.ndarray, "X Y"], step_m: float
+) -> Float[np.ndarray, "X Y"]:
+    """Heights averaged over the observed columns around each, no farther off than half a voxel."""
+    from scipy.ndimage import correlate1d
+
+    weights = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _SIGMA) ** 2)
+
+    def spread(values: np.ndarray) -> np.ndarray:
+        for axis in (0, 1):
+            values = correlate1d(values, weights, axis=axis, mode="constant")
+        return values
+
+    height_m = np.asarray(height_m, np.float64)
+    mean_m = spread(np.where(observed, height_m, 0.0)) / np.maximum(spread(observed.astype(np.float64)), 1e-12)
+    return mean_m.clip(height_m - step_m / 2, height_m + step_m / 2)
