@@ -1,7 +1,7 @@
 """The top-down surface as triangles with coloured corners: a height field, which looks as the ground does.
 
-An isosurface of the voxels would show their noise as layers and holes; the rover saw the ground from above. Steps of the
-voxels are smoothed, but the surface stays within the voxel that it was seen in.
+An isosurface of the voxels would show their noise as layers and holes; the rover saw the ground from above. Steps of
+the voxels are smoothed, but the surface stays within the voxel that it was seen in.
 """
 
 from __future__ import annotations
