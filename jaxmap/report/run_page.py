@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -127,10 +127,7 @@ def read_run(run: Path) -> RunContents:
             trajectory_world = read_poses(run / "poses.tum").T[:, :3, 3] - attributes.site_origin
         except JaxmapError:
             remarks.append("poses.tum could not be read: the path is left out.")
-    pictures: dict[str, dict[str, Path]] = {}
-    for picture in sorted((run / "pictures").glob("*.png")):
-        if match := _PICTURE_NAME.fullmatch(picture.name):
-            pictures.setdefault(match["frame"], {})[match["kind"]] = picture
+    pictures = find_pictures(run)
     voxels = occupied_voxels(voxel_map, params, rule)
     return RunContents(run, voxel_map, attributes, params, rule, voxels, metrics, trajectory_world, pictures, remarks)
 
@@ -291,7 +288,7 @@ def in_3d(contents: RunContents) -> str:
     """The section with the interactive view; a page holds one at most."""
     if not len(contents.voxels.label):
         return section("In 3D", "<p>No voxel is occupied.</p>")
-    seen = seen_frames(contents)
+    seen = [*seen_frames(contents.pictures, contents.group("camera")).values()]
     view = voxel_view(
         contents.voxels,
         contents.voxel_map.classes,
@@ -307,25 +304,36 @@ def in_3d(contents: RunContents) -> str:
     )
 
 
-def seen_frames(contents: RunContents) -> list[SeenFrame]:
-    """The key frames with their cameras; those that are not whole are left out."""
-    frames, camera = [], contents.group("camera")
-    poses = camera.get("key_frames")
+def seen_frames(pictures: Mapping[str, Mapping[str, Path]], camera: Mapping[str, Any]) -> dict[str, SeenFrame]:
+    """The key frames with their cameras, by name; those that are not whole are left out.
+
+    Args:
+        pictures: of `find_pictures`.
+        camera: that of `metrics.json`.
+    """
+    frames, poses = {}, camera.get("key_frames")
     for name, pose in poses.items() if isinstance(poses, dict) else ():
         try:
-            with open_picture(contents.pictures[name]["left"]) as image:
+            with open_picture(pictures[name]["left"]) as image:
                 pixels = np.asarray(image)
-            frames.append(
-                SeenFrame(
-                    pixels,
-                    np.array(pose, np.float64).reshape(4, 4),
-                    (camera["fx_px"], camera["fy_px"]),
-                    (camera["cx_px"], camera["cy_px"]),
-                )
+            frames[name] = SeenFrame(
+                pixels,
+                np.array(pose, np.float64).reshape(4, 4),
+                (camera["fx_px"], camera["fy_px"]),
+                (camera["cx_px"], camera["cy_px"]),
             )
         except (FrameError, KeyError, ValueError, TypeError):
             continue
     return frames
+
+
+def find_pictures(run: Path) -> dict[str, dict[str, Path]]:
+    """The pictures of key frames by kind (left, disparity, labels), by the number of the frame."""
+    pictures: dict[str, dict[str, Path]] = {}
+    for picture in sorted((run / "pictures").glob("*.png")):
+        if match := _PICTURE_NAME.fullmatch(picture.name):
+            pictures.setdefault(match["frame"], {})[match["kind"]] = picture
+    return pictures
 
 
 def key_frame_row(contents: RunContents, frame: str) -> str:

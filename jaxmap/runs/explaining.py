@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +25,8 @@ from jaxmap.mapping.store import Columns, MapReader, open_map
 from jaxmap.report.explain_page import Explanation, FramePart
 from jaxmap.runs.config import load_config
 from jaxmap.runs.folder import RunFolder
-from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
+from jaxmap.runs.labelling import Notify
+from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.types import VoxelMap, pinhole, to_device
 
 _MOST_APART = 1e-3
@@ -206,12 +208,11 @@ def explain_cell(
 
 def _frames(plan: Plan, indices: list[int]) -> Iterator[tuple[int, PreparedFrame]]:
     """Some frames of a plan, made ready."""
-    chosen = replace(
-        plan.sequence,
-        frames=[plan.sequence.frames[index] for index in indices],
-        T_world_camera=plan.sequence.T_world_camera[indices],
-    )
-    frames = prepare_frames(chosen, plan.front_end, plan.label_folder, needs=plan.labeller.needs)
+    if plan.observations is not None:
+        frames = replace(plan, observations=plan.observations.selected(np.array(indices))).prepare()
+    else:
+        more: Any = {"needs": plan.labeller.needs, "indices": indices}
+        frames = prepare_frames(plan.sequence, plan.front_end, plan.label_folder, **more)
     yield from zip(indices, frames, strict=True)
 
 

@@ -23,7 +23,8 @@ from jaxmap.mapping.merge import add_maps, check_alike, common_grid, digests_of
 from jaxmap.mapping.store import MapReader, open_map
 from jaxmap.mapping.tiles import TileStore
 from jaxmap.report.run_page import write_report
-from jaxmap.runs.folder import RunFolder, count_voxels, write_exports, write_poses
+from jaxmap.runs.exports import write_exports
+from jaxmap.runs.folder import RunFolder, count_voxels, write_poses
 
 _PICTURE = re.compile(r"(?P<frame>\d{6})_(?P<kind>left|disparity|labels)\.png")
 _PAUSE_S = 1.0
