@@ -19,12 +19,13 @@ class ExportArguments:
 
     Maps of any size are gone through tile by tile. Without --format: PLY (occupied voxels), GeoTIFF (top-down map) and
     PNG. Where the run has an ensemble, the GeoTIFF holds its layers, and a second PNG shows what the map may have
-    missed.
+    missed. For COLMAP and what reads its models, colmap/ holds cameras.txt, images.txt, points3D.txt and the rectified
+    images.
     """
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
-    format: tuple[Literal[tuple(FORMATS)], ...] = OF_EACH_RUN  # pyright: ignore[reportInvalidTypeForm]
+    format: tuple[Literal[(*FORMATS, "colmap")], ...] = OF_EACH_RUN  # pyright: ignore[reportInvalidTypeForm]
     """What to write; several at once are separated by spaces."""
     colours: Literal["classes", "images"] = "classes"
     """Colours of points and surfaces: of their classes, or of the run's key frames."""
@@ -40,8 +41,16 @@ def main(words: Sequence[str]) -> int:
 
     folder, console = RunFolder(arguments.run), Console()
     folder.settle_for_reading()
-    with console.steps("exporting", "forms", len(arguments.format)) as advance:
-        options = dict(colours=arguments.colours, notify=console.notify, advance=advance)
-        written = write_exports(folder, open_map(folder.map), arguments.format, **options)
+    formats = [form for form in arguments.format if form != "colmap"]
+    written: list[str] = []
+    if formats:
+        with console.steps("exporting", "forms", len(formats)) as advance:
+            options = dict(colours=arguments.colours, notify=console.notify, advance=advance)
+            written += write_exports(folder, open_map(folder.map), formats, **options)
+    if "colmap" in arguments.format:
+        from jaxmap.runs.colmap import export_colmap
+
+        with console.counted("images", "images") as count:
+            written += export_colmap(folder, console.notify, count)
     console.result(arguments.run, written)
     return 0

@@ -16,8 +16,9 @@ from jaxmap.export.source import KeyFrame, Pinholes, Source, Track
 from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import read_bytes
 from jaxmap.mapping.store import MapReader
+from jaxmap.report.drive_view import seen_frames
 from jaxmap.report.image_colours import SeenFrame, image_colours
-from jaxmap.report.run_page import find_pictures, seen_frames
+from jaxmap.report.run_contents import find_pictures
 from jaxmap.runs.folder import RunFolder
 
 _MOST_PICTURE_BYTES = 256 << 20
@@ -103,8 +104,10 @@ def _read_track(folder: RunFolder, reader: MapReader, frames: dict[str, SeenFram
     for name, frame in frames.items():
         # Rectifying turns a camera about its centre: the frame is the one that was there.
         off_m = np.linalg.norm(T[:, :3, 3] - frame.T_world_camera[:3, 3], axis=-1)
-        if len(off_m) and off_m.min() < _NEAR_M:
-            image = read_bytes(Path(pictures[name]["left"]), _MOST_PICTURE_BYTES)
+        picture = pictures[name]["left"]
+        # The others are smaller than the images that the camera is of.
+        if picture.suffix == ".png" and len(off_m) and off_m.min() < _NEAR_M:
+            image = read_bytes(picture, _MOST_PICTURE_BYTES)
             key_frames.append(KeyFrame(float(times_s[off_m.argmin()]), frame.T_world_camera, image))
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
     camera = _camera(folder) if frames else {}

@@ -29,10 +29,20 @@ from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_key_
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Plan
+from jaxmap.runs.run_frames import write_frame_table
 from jaxmap.types import VoxelMap
 
+_PICTURES_AT_ONCE = 4
+"""Frames that wait for their pictures to be written; each holds some 10 MB."""
 FEW_MATCHED = 0.01
 """Where fewer pixels of a frame have a depth in range, it is not the bounds that leave a map empty."""
+
+Watch = Callable[[FusedFrame, VoxelMap], None]
+"""Looks at the map after each frame; the next frame takes the map's memory."""
+
+
+def unwatched(fused: FusedFrame, voxel_map: VoxelMap) -> None:
+    """Looks at nothing."""
 
 
 def run_plan(
@@ -43,6 +53,7 @@ def run_plan(
     checkpoint_every_s: float,
     notify: Notify,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
+    watch: Watch = unwatched,
     profile: bool = False,
     report: bool = True,
 ) -> dict[str, Any]:
@@ -58,6 +69,7 @@ def run_plan(
         checkpoint_every_s: how often the map is saved on the way.
         notify: takes lines for the user.
         on_frame: called after each frame.
+        watch: looks at the map after each frame (`viewing.live_view`).
         profile: record a trace of some steps into the folder, and report where their time went.
         report: write the page of the run.
 
@@ -95,9 +107,14 @@ def run_plan(
                 # Pictures wait for the next save; noted before the frame counts, so that an interrupt loses none.
                 key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
             log.add(fused, _disparity_scores(plan, fused))
+            if len(key_frames) >= _PICTURES_AT_ONCE:
+                started_s = time.perf_counter()
+                _write_key_frames(plan, folder, key_frames)
+                resumed_s += time.perf_counter() - started_s
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
+            watch(fused, voxel_map)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 _save(plan, folder, log, memory, voxel_map, key_frames)
@@ -256,6 +273,7 @@ def _write_outputs(
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
+    write_frame_table(folder.frames, plan.sequence.frames, skipped)
     write_exports(folder, reader)
     metrics = _metrics(plan, log, reader) | count_missed(plan.rule, reader, plan.members) | details
     write_json(folder.metrics, metrics)
@@ -318,7 +336,8 @@ def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[Prep
         labels = None
         if plan.labeller.classes:
             labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
-        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
+        large = plan.key_frames[prepared.index]
+        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
     key_frames.clear()
 
 
@@ -356,8 +375,9 @@ def _metrics(plan: Plan, log: RunLog, reader: MapReader) -> dict[str, Any]:
             # Poses of the rectified camera, relative to the site origin.
             "key_frames": {
                 f"{index:06d}": (sequence.T_world_camera[index] @ plan.front_end.T_raw_rectified).round(6).tolist()
-                for index in sorted(plan.key_frames)
+                for index in plan.key_frames
             },
+            "T_raw_rectified": plan.front_end.T_raw_rectified.round(9).tolist(),
         },
         "grid": {
             "shape": list(grid.shape),

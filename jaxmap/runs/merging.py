@@ -26,7 +26,7 @@ from jaxmap.report.run_page import write_report
 from jaxmap.runs.exports import write_exports
 from jaxmap.runs.folder import RunFolder, count_voxels, write_poses
 
-_PICTURE = re.compile(r"(?P<frame>\d{6})_(?P<kind>left|disparity|labels)\.png")
+_PICTURE = re.compile(r"(?P<frame>\d{6})_(?P<kind>left|disparity|labels)\.(?P<ending>png|webp)")
 _PAUSE_S = 1.0
 """Between sessions whose times overlap, where the later is told as if it had come after."""
 
@@ -172,9 +172,10 @@ def _times_s(track: PoseTrack) -> np.ndarray:
 
 def _take_key_frames(session: Session, folder: RunFolder, first: int, site_origin: np.ndarray) -> dict[str, Any]:
     """Copies the pictures of a session under numbers that go on from `first`, and returns their poses by those."""
-    for picture in sorted(session.folder.pictures.glob("*.png")):
+    for picture in sorted(session.folder.pictures.glob("*")):
         if match := _PICTURE.fullmatch(picture.name):
-            with atomic_path(folder.pictures / f"{int(match['frame']) + first:06d}_{match['kind']}.png") as temporary:
+            name = f"{int(match['frame']) + first:06d}_{match['kind']}.{match['ending']}"
+            with atomic_path(folder.pictures / name) as temporary:
                 shutil.copyfile(picture, temporary)
     poses = session.group("camera").get("key_frames")
     moved = {}
