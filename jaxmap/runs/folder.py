@@ -25,6 +25,7 @@ from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.host.replacement import Replacement
 from jaxmap.mapping.store import MapReader, holds_map, stray_maps
+from jaxmap.report.detail import FOLDER
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
 from jaxmap.runs.config import OBSERVATIONS
 from jaxmap.stereo.front_end import RectifiedFrame
@@ -167,7 +168,7 @@ class RunFolder:
 
     def _outputs(self) -> Iterator[Path]:
         """What an earlier run has written, and nothing else."""
-        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, *self._files)
+        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, self.path / FOLDER, *self._files)
         for picture in self.pictures.glob("*"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 yield picture
