@@ -69,13 +69,16 @@
     const colorscale = map.colours.flatMap((colour, i) => [[i / steps, colour], [(i + 1) / steps, colour]]);
     const trace = {
       type: "mesh3d", ...meshOf(voxels, name), intensitymode: "cell", flatshading: true, hoverinfo: "x+y+z", colorscale,
-      cmin: -0.5, cmax: last + 0.5,
+      cmin: -0.5, cmax: last + 0.5, lightposition: { x: -6e4, y: -2e4, z: 1e5 },
+      lighting: { ambient: 0.65, diffuse: 0.5, specular: 0.03, roughness: 0.9, fresnel: 0 },
       colorbar: { thickness: 10, len: 0.5, tickvals: map.names.map((_, i) => i), ticktext: map.names },
     };
     const look = getComputedStyle(document.documentElement), axis = { visible: false };
     const layout = {
-      margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: "rgba(0,0,0,0)", font: { color: look.getPropertyValue("--ink").trim() },
-      scene: { xaxis: axis, yaxis: axis, zaxis: axis, aspectmode: "data", camera: { eye: { x: -0.6, y: -1.1, z: 0.9 } } },
+      margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: "rgba(0,0,0,0)",
+      font: { color: look.getPropertyValue("--ink").trim(), family: getComputedStyle(document.body).fontFamily },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: look.getPropertyValue("--quiet").trim() },
+      scene: { xaxis: axis, yaxis: axis, zaxis: axis, aspectmode: "data", camera: { eye: { x: -0.9, y: -1.6, z: 1.1 } } },
     };
     if (!place.data) place.textContent = "";
     await Plotly.react(place, [trace], layout, { displaylogo: false, responsive: true, scrollZoom: true });
