@@ -70,7 +70,7 @@
     const trace = {
       type: "mesh3d", ...meshOf(voxels, name), intensitymode: "cell", flatshading: true, hoverinfo: "x+y+z", colorscale,
       cmin: -0.5, cmax: last + 0.5, lightposition: { x: -6e4, y: -2e4, z: 1e5 },
-      lighting: { ambient: 0.65, diffuse: 0.5, specular: 0.03, roughness: 0.9, fresnel: 0 },
+      lighting: { ambient: 0.65, diffuse: 0.5, specular: 0.03, roughness: 0.9, fresnel: 0, facenormalsepsilon: 0, vertexnormalsepsilon: 0 },
       colorbar: { thickness: 10, len: 0.5, tickvals: map.names.map((_, i) => i), ticktext: map.names },
     };
     const look = getComputedStyle(document.documentElement), axis = { visible: false };

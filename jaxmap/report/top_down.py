@@ -137,7 +137,6 @@ def draw(
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     left = _LEFT_PX + (width - _LEFT_PX - _RIGHT_PX - map_width) // 2
     axes_at = (left / width, (legend_px + _BELOW_PX) / height, map_width / width, map_height / height)
-
     axes = figure.add_axes(axes_at, facecolor=np.array(UNOBSERVED_COLOUR) / 255)
     extent = (sheet.origin_m[0], end_m[0], sheet.origin_m[1], end_m[1])
     picture = sheet.colours.transpose(1, 0, 2)
@@ -159,8 +158,7 @@ def draw(
     if overlay is not None:
         overlay(axes)
     axes.text(0.5, 0.5, sheet.remark, ha="center", va="center", transform=axes.transAxes, color=FAINT)
-    title_at = (_LEFT_PX / width, 1 - 42 / height)
-    figure.text(*title_at, title, size=13, weight="bold", va="center", color=INK)
+    figure.text(_LEFT_PX / width, 1 - 42 / height, title, size=13, weight="bold", va="center", color=INK)
 
     spacing: dict[str, Any] = dict(handlelength=1.1, handleheight=1.1, columnspacing=1.6, borderaxespad=0, borderpad=0)
     anchor: dict[str, Any] = dict(
@@ -171,8 +169,8 @@ def draw(
     _draw_scale(axes, (width - _RIGHT_PX, scale_px), _nice(0.11 * map_width / px_per_m), north=sheet.georeferenced)
     if sheet.bar:
         _draw_bar(figure.add_axes((_LEFT_PX / width, 54 / height, 400 / width, 18 / height)), sheet.bar)
-    edges = (left, height - legend_px - _BELOW_PX - map_height, map_width, map_height)
-    place = dict(zip(PLACE, (*edges, *low_m.tolist(), *high_m.tolist()), strict=True))
+    edges_px = (left, height - legend_px - _BELOW_PX - map_height, map_width, map_height)
+    place = dict(zip(PLACE, (*edges_px, *low_m.tolist(), *high_m.tolist()), strict=True))
     with atomic_path(path) as temporary:
         FigureCanvasAgg(figure).print_png(temporary, metadata={PLACE_KEY: json.dumps(place)})
 

@@ -89,12 +89,12 @@ def run_plan(
     saved_s = resumed_s = time.perf_counter()
     if plan.keeper is not None:
         plan.keeper.begin(folder.observations)
-    frames = plan.prepare(log.next_index, keep_in=folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
+    frames = plan.prepare(log.next_index, keep_in=folder.observations)
     run = run_sequence(
         plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form, cover=memory.cover
     )
-    key_frames: list[tuple[PreparedFrame, int]] = []
+    pictures = _Pictures(plan, folder)
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
@@ -103,32 +103,27 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
-            if fused.info is not None and fused.prepared.index in plan.key_frames:
-                # Pictures wait for the next save; noted before the frame counts, so that an interrupt loses none.
-                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
+            pictures.note(fused, voxel_map)
             log.add(fused, _disparity_scores(plan, fused))
-            if len(key_frames) >= _PICTURES_AT_ONCE:
-                started_s = time.perf_counter()
-                _write_key_frames(plan, folder, key_frames)
-                resumed_s += time.perf_counter() - started_s
+            resumed_s += pictures.write_many()
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
             watch(fused, voxel_map)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
-                _save(plan, folder, log, memory, voxel_map, key_frames)
+                _save(plan, log, memory, voxel_map, pictures)
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
-            _save(plan, folder, log, memory, voxel_map, key_frames)
+            _save(plan, log, memory, voxel_map, pictures)
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
         step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
-    _write_key_frames(plan, folder, key_frames)
+    pictures.write()
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
@@ -198,16 +193,9 @@ class _TiledMap:
         return open_map(self.path)
 
 
-def _save(
-    plan: Plan,
-    folder: RunFolder,
-    log: RunLog,
-    memory: _WholeMap | _TiledMap,
-    voxel_map: VoxelMap,
-    key_frames: list[tuple[PreparedFrame, int]],
-) -> None:
+def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: _Pictures) -> None:
     """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
-    _write_key_frames(plan, folder, key_frames)
+    pictures.write()
     memory.save(voxel_map, _attributes(plan, log, voxel_map))
 
 
@@ -329,16 +317,37 @@ def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
     )
 
 
-def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[PreparedFrame, int]]) -> None:
-    """Writes pictures of frames, with the labels that the step gave each as the so manieth, and empties the list."""
-    for prepared, number in key_frames:
-        assert prepared.frame is not None and prepared.rectified is not None
-        labels = None
-        if plan.labeller.classes:
-            labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
-        large = plan.key_frames[prepared.index]
-        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
-    key_frames.clear()
+class _Pictures:
+    """Key frames that wait for their pictures to be written."""
+
+    def __init__(self, plan: Plan, folder: RunFolder) -> None:
+        self.plan, self.folder = plan, folder
+        self.waiting: list[tuple[PreparedFrame, int]] = []
+
+    def note(self, fused: FusedFrame, voxel_map: VoxelMap) -> None:
+        """Keeps a key frame; to be called before the frame counts, so that an interrupt loses none."""
+        if fused.info is not None and fused.prepared.index in self.plan.key_frames:
+            self.waiting.append((fused.prepared, int(voxel_map.frames_fused) - 1))
+
+    def write_many(self) -> float:
+        """Writes pictures where many wait, and returns how long that took, in seconds."""
+        if len(self.waiting) < _PICTURES_AT_ONCE:
+            return 0.0
+        started_s = time.perf_counter()
+        self.write()
+        return time.perf_counter() - started_s
+
+    def write(self) -> None:
+        """Writes all, with the labels that the step gave each frame as the so manieth."""
+        plan = self.plan
+        for prepared, number in self.waiting:
+            assert prepared.frame is not None and prepared.rectified is not None
+            labels = None
+            if plan.labeller.classes:
+                labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
+            large = plan.key_frames[prepared.index]
+            write_key_frame(self.folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
+        self.waiting.clear()
 
 
 def _metrics(plan: Plan, log: RunLog, reader: MapReader) -> dict[str, Any]:

@@ -81,12 +81,13 @@ class Perception:
     def key_frames(self) -> dict[int, bool]:
         """The frames whose pictures are kept, by their index, and whether at full size.
 
-        Of frames that were observed, all those that have a picture.
+        With observations, those that have a picture.
         """
         count = len(self.sequence.frames)
-        if self.observations is not None:
-            return {index: True for index in range(count) if self.observations.picture(index) is not None}
-        spaced = np.linspace(0, count - 1, _KEY_FRAMES).round().astype(int).tolist()
+        if self.observations is None:
+            spaced = np.linspace(0, count - 1, _KEY_FRAMES).round().astype(int).tolist()
+        else:
+            spaced = [index for index in range(count) if self.observations.picture(index) is not None]
         # Of frames taken twice, in a short sequence, the large one counts.
         small = dict.fromkeys(spaced, False)
         return dict(sorted((small | dict.fromkeys(spaced[::_LARGE_EVERY], True)).items()))
