@@ -230,7 +230,7 @@ def _attributes(
         T_world_source=matrix_of(sequence.T_world_source),
         notes=sequence.notes,
         findings=tuple(findings_tree(seen.findings)),
-        key_frames={sequence.frames[index].name: index for index, large in seen.key_frames.items() if large},
+        key_frames={sequence.frames[index].name: index for index in sorted(seen.key_frames)},
         frames=len(sequence.frames),
     )
 
@@ -325,7 +325,7 @@ def run_perception(
     for prepared in keeper.frames(folder.observations, missing):
         if strict and prepared.fault is not None:
             raise prepared.fault
-        if prepared.frame is not None and seen.key_frames.get(prepared.index):
+        if prepared.frame is not None and prepared.index in seen.key_frames:
             assert prepared.rectified is not None
             write_key_frame(folder, prepared.index, prepared.rectified, None, ())
         log.add(prepared)
