@@ -103,9 +103,9 @@ def main() -> None:
     beside = sum(file.stat().st_size for file in (run / "report.parts").glob("*"))
     each_s, page_mb = 100 * report_s / len(reader.places), (run / "report.html").stat().st_size / 1e6
     print(
-        f"picture {drawn_s - started_s:.1f} s, report {report_s:.1f} s ({each_s:.2f} s for a hundred columns of tiles), "
-        f"peak {peak_resident_mib():.0f} MiB, page {page_mb:.1f} MB, beside it {beside / 1e6:.1f} MB"
+        f"picture {drawn_s - started_s:.1f} s, report {report_s:.1f} s ({each_s:.2f} s for a hundred columns of tiles)"
     )
+    print(f"peak {peak_resident_mib():.0f} MiB, page {page_mb:.1f} MB, beside it {beside / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":
