@@ -174,6 +174,7 @@ class Mapper(NamedTuple):
             a leading axis, equal to a loop over `step`.
         label_image: `(frame, params, key, number) -> uint8 (H, W)`, the labels that the step gives
             the pixels of the frame when `number` frames were fused before it; `IGNORE` where none.
+        design: what was decided before the step was compiled.
         lower: the arguments of `step` -> `jax.stages.Lowered`, for its cost, memory and HLO.
         compilations: how often `step` has been compiled so far.
     """
@@ -183,6 +184,7 @@ class Mapper(NamedTuple):
     fuse: Step
     scan: Step
     label_image: Callable[[Frame, MapperParams, PRNGKeyArray, int], UInt8[Array, "H W"]]
+    design: StepDesign
     lower: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], jax.stages.Lowered]
     compilations: Callable[[], int]
 
@@ -251,6 +253,7 @@ def make_mapper(
         fuse=fuse,
         scan=jax.jit(scan),
         label_image=jax.jit(label),
+        design=design,
         lower=lambda voxel_map, *inputs: compiled.lower(*_apart(voxel_map), *inputs),
         compilations=compiled._cache_size,
     )
