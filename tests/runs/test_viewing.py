@@ -35,14 +35,16 @@ def run(tmp_path) -> Path:
     """A run of 21 frames, of which the last but one was skipped."""
     run = make_run(tmp_path / "run")
     add_cameras(run)
-    metrics = json.loads((run / "metrics.json").read_text())
-    metrics["camera"] |= {"baseline_m": 0.12, "doffs_px": 0.0, "T_raw_rectified": np.eye(4).tolist()}
-    (run / "metrics.json").write_text(json.dumps(metrics))
     # Looking east and down.
     T = np.tile(np.array([[0.0, -0.3, 0.95, 0], [-1, 0, 0, 0], [0, -0.95, -0.3, 0], [0, 0, 0, 1]]), (20, 1, 1))
     T[:, :3, :3] /= np.linalg.norm(T[:, :3, :3], axis=1, keepdims=True)
     T[:, :3, 3] = read_poses(run / "poses.tum").T[:, :3, 3]
     write_tum(run / "poses.tum", 100.0 + np.array([*range(19), 20]), T)
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics["camera"] |= {"baseline_m": 0.12, "doffs_px": 0.0, "T_raw_rectified": np.eye(4).tolist()}
+    local = T - np.pad(SITE[:, None], ((0, 1), (3, 0)))
+    metrics["camera"]["key_frames"] = {"000000": local[0].tolist(), "000020": local[-1].tolist()}
+    (run / "metrics.json").write_text(json.dumps(metrics))
     write_frame_table(run / "frames.csv", frame_names(21), {"left, 19": 'it is "black"'})
     return run
 
@@ -128,6 +130,9 @@ def test_a_run_becomes_a_recording(cli, run, tmp_path) -> None:
 def test_a_run_from_before_says_what_it_shows(cli, run, tmp_path) -> None:
     pytest.importorskip("rerun")
     (run / "frames.csv").unlink()
+    assert cli("view", run, "--save", tmp_path / "f.rrd").status == 0
+    pictures = rows_of(tmp_path / "f.rrd")["/labels"]
+    assert sorted({row["frame"] for row in pictures}) == [0, 19], "by where they were taken"
     metrics = json.loads((run / "metrics.json").read_text())
     del metrics["camera"]
     (run / "metrics.json").write_text(json.dumps(metrics))
