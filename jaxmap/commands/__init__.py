@@ -6,7 +6,7 @@ COMMANDS: dict[str, str] = {
     "demo": "map the bundled sample with every labeller and compare the scores",
     "check": "say what is wrong with a sequence before it is mapped",
     "map": "map a stereo sequence",
-    "train": "train or fine-tune DeepLabv3+ on images and masks",
+    "train": "train or fine-tune DeepLabv3+, FCN-8s, SegNet or U-Net on images and masks",
     "refine": "refine poses, camera mounting and stereo calibration until frames agree",
     "evaluate": "score a map against a labelled orthomosaic",
     "tune": "tune the fusion parameters against ground truth",

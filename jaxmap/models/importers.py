@@ -19,7 +19,7 @@ from jaxmap.labels import ROVER_CLASSES
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture, torchvision_architecture
 from jaxmap.models.backbones import INVERTED_RESIDUAL_STAGES, RESNET_UNITS
 from jaxmap.models.checkpoint import Holds, raise_mismatch
-from jaxmap.models.deeplab import weight_shapes
+from jaxmap.models.network import weight_shapes
 from jaxmap.models.one_channel import with_complement
 from jaxmap.models.tensor_files import Tensors, as_float32, read_tensors, shortened
 from jaxmap.models.wrappers import Choice, Recognise, choose_network

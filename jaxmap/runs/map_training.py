@@ -28,7 +28,7 @@ from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import MapperParams
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel, load_network
-from jaxmap.models.deeplab import Weights, fold_batch_norm
+from jaxmap.models.network import Weights, fold_batch_norm
 from jaxmap.runs.evaluation import class_layer_of
 from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
 from jaxmap.runs.segmentation import Segmenter

@@ -14,8 +14,8 @@ from safetensors.numpy import save_file
 
 from jaxmap.models import importers as tables
 from jaxmap.models.architecture import Architecture, tf_architecture
-from jaxmap.models.deeplab import fold_batch_norm, pure_network
 from jaxmap.models.importers import Row, convert, import_weights
+from jaxmap.models.network import fold_batch_norm, pure_network
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "originals_golden.npz"
 CLASSES = ("class_0", "class_1", "class_2")

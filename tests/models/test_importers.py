@@ -18,8 +18,8 @@ from jaxmap.models.architecture import (
     torch_architecture,
     torchvision_architecture,
 )
-from jaxmap.models.deeplab import weight_shapes
 from jaxmap.models.importers import VOC_CLASSES, convert, import_weights
+from jaxmap.models.network import weight_shapes
 
 DEEPEST = pytest.param("resnet101", marks=pytest.mark.slow)
 

@@ -12,7 +12,7 @@ from tiny_training import compiled_quickly
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import weight_shapes
+from jaxmap.models.network import weight_shapes
 from jaxmap.training.initial_network import InitialNetwork, make_initial_network
 from jaxmap.training.options import BatchNormOptions, NetworkOptions
 

@@ -25,19 +25,18 @@ from jaxmap.models.architecture import (
     torchvision_architecture,
 )
 from jaxmap.models.backbones import InvertedResidual, ResidualUnit, XceptionUnit
-from jaxmap.models.deeplab import (
-    DeepLab,
+from jaxmap.models.base import padded_size, placed_relief
+from jaxmap.models.heads import Aspp, Decoder
+from jaxmap.models.network import (
+    KINDS,
     fold_batch_norm,
     inference_network,
     make_network,
     network_weights,
-    padded_size,
-    placed_relief,
     pure_network,
     training_form,
     weight_shapes,
 )
-from jaxmap.models.heads import Aspp, Decoder
 
 CLASSES = ("background", "sand", "rock")
 SMALL = replace(torch_architecture("mobilenet_v2", CLASSES), top_conv=False, head_channels=8, low_level_channels=4)
@@ -138,12 +137,16 @@ ALL_STRIDES = [
 )
 def test_every_backbone_has_the_right_strides(backbone, stride, family):
     architecture = family(backbone, CLASSES, output_stride=stride)
-    network = nnx.eval_shape(lambda: DeepLab(architecture))
+    network = nnx.eval_shape(lambda: KINDS[architecture.kind](architecture))
     sizes = [padded_size(size, architecture) for size in (50, 65)]
     images = jax.ShapeDtypeStruct((1, *sizes, 3), jnp.float32)
-    features, low_level = nnx.eval_shape(lambda model, x: model.backbone(x), network, images)
-    assert features.shape == (1, *(-(-size // stride) for size in sizes), network.backbone.channels)
-    assert low_level.shape == (1, *(-(-size // 4) for size in sizes), network.backbone.low_level_channels)
+    levels, places = nnx.eval_shape(lambda model, x: model.backbone(x), network, images)
+    strides = [step for step in (4, 8, 16) if step <= stride]
+    assert [level.shape for level in levels] == [
+        (1, *(-(-size // step) for size in sizes), channels)
+        for step, channels in zip(strides, network.backbone.channels, strict=True)
+    ]
+    assert places == ()
 
 
 def test_tensorflow_sizes_are_a_multiple_and_one():
