@@ -47,9 +47,10 @@ class Architecture:
     """A segmentation network, apart from its weights; stored in every model file.
 
     Families of conventions exist. The fields' defaults are those of segmentation_models_pytorch 0.6.0
-    (`DeepLabV3Plus`; `torch_architecture` gives its `Unet`, too); `tf_architecture` gives those of the original TensorFlow networks (Chen et al.
-    2018, "Encoder-Decoder with Atrous Separable Convolution"), `torchvision_architecture` those of
-    torchvision's DeepLabv3 (Chen et al. 2017, "Rethinking Atrous Convolution") and FCN.
+    (`DeepLabV3Plus`; `torch_architecture` gives its `Unet`, too); `tf_architecture` gives those of the original
+    TensorFlow networks (Chen et al. 2018, "Encoder-Decoder with Atrous Separable Convolution"),
+    `torchvision_architecture` those of torchvision's DeepLabv3 (Chen et al. 2017, "Rethinking Atrous Convolution")
+    and FCN.
 
     Attributes:
         backbone: the network that computes the features.

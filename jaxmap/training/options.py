@@ -174,7 +174,8 @@ class NetworkOptions:
     output_stride: Literal[32, 16, 8] | None = None
     """Input pixels for each of the coarsest features: 16 or 8 of DeepLab, 32 of the others."""
     head_channels: Annotated[int, Interval(ge=1, le=4096)] | None = None
-    """Channels of ASPP and decoder, or of FCN's convolution; those of U-Net's first step, halved at each further one."""
+    """Channels of ASPP and decoder, or of FCN's convolution; those of U-Net's first step, halved at each
+    further one."""
     atrous_rates: tuple[Annotated[int, Interval(ge=1, le=1024)], ...] | None = None
     """Dilations of the ASPP branches."""
     decoder: bool | None = None

@@ -78,8 +78,9 @@ def main() -> None:
             for kind in KINDS:
                 out = run_folder(given.out, name, kind, seed)
                 train(folder, out, words | {"--network.kind": kind, "--seed": seed}, DATA[name], given.crop_px)
-    columns = {"data": "<12", "network": "<12", "rock IoU": "10.3f", "least": "7.3f", "most": "7.3f", "mean IoU": "10.3f"}
-    table = Table({**columns, "parameters": "12,d", "train min": "11.1f", "label ms": "10.0f"})
+    scores = {"rock IoU": "10.3f", "least": "7.3f", "most": "7.3f", "mean IoU": "10.3f"}
+    costs = {"parameters": "12,d", "train min": "11.1f", "label ms": "10.0f"}
+    table = Table({"data": "<12", "network": "<12", **scores, **costs})
     for name in folders:
         times_ms = label_times_ms({kind: run_folder(given.out, name, kind, 0) for kind in KINDS})
         for kind in KINDS:

@@ -11,7 +11,7 @@ from safetensors.numpy import save_file
 from torch_legacy import legacy_bytes
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models import importers as tables
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import (
     Architecture,
     tf_architecture,
