@@ -65,7 +65,8 @@ def test_the_gradient_of_pooling_goes_to_the_pixel_that_won():
 def test_a_small_network_keeps_the_laws(kind):
     """Size, padding, batch, folding, eager and compiled, the same bits twice."""
     record = small(kind)
-    weights, image = seeded_weights(record), seeded_image(45, 61)[None]
+    weights = {name: jnp.asarray(value) for name, value in seeded_weights(record).items()}
+    image = jnp.asarray(seeded_image(45, 61)[None])
     apply = pure_network(record, weights).apply
     compiled = jax.jit(apply)
     logits = np.asarray(compiled(weights, image))
