@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from types import MappingProxyType
@@ -47,15 +48,18 @@ def _skeleton(architecture: Architecture) -> Network:
 def initial_weights(architecture: Architecture, key: PRNGKeyArray) -> Weights:
     """Random weights: kernels by He et al. 2015, norms that do nothing, biases of 0.
 
-    They are drawn on the host, the same on every machine.
+    Classifiers start with logits on the scale of their features: large ones would have to be unlearnt first. All are
+    drawn on the host, the same on every machine.
     """
     draw = np.random.default_rng(np.asarray(jax.random.key_data(key)))
 
     def array(name: str, shape: tuple[int, ...]) -> Array:
         if len(shape) == 4:
             # The variance is kept on the way back through the ReLUs; a depthwise kernel feeds one output.
-            fan = shape[0] * shape[1] * (shape[3] if shape[2] > 1 or shape[0] == 1 else 1)
-            return jnp.asarray(draw.standard_normal(shape, np.float32) * np.float32(np.sqrt(2 / fan)))
+            variance = 2 / (shape[0] * shape[1] * (shape[3] if shape[2] > 1 or shape[0] == 1 else 1))
+            if name.startswith("classifier."):
+                variance = 1 / math.prod(shape[:3])
+            return jnp.asarray(draw.standard_normal(shape, np.float32) * np.float32(np.sqrt(variance)))
         return jnp.asarray(np.full(shape, name.endswith((".norm.scale", ".norm.var")), np.float32))
 
     return {name: array(name, shape) for name, shape in weight_shapes(architecture).items()}

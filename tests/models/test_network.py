@@ -31,6 +31,7 @@ from jaxmap.models.network import (
     KINDS,
     fold_batch_norm,
     inference_network,
+    initial_weights,
     make_network,
     network_weights,
     pure_network,
@@ -121,6 +122,15 @@ def test_the_network_of_a_key_is_always_the_same():
     assert {name: value.shape for name, value in one.items()} == shapes
     assert all(np.array_equal(one[name], same[name]) for name in shapes)
     assert not np.array_equal(one["backbone.stem.kernel"], other["backbone.stem.kernel"])
+
+
+@pytest.mark.parametrize("kind", ["deeplab", "fcn", "segnet", "unet"])
+def test_classifiers_start_with_logits_on_the_scale_of_the_features(kind):
+    record = replace(torch_architecture("mobilenet_v2", CLASSES, kind=kind), top_conv=False)
+    for name, kernel in initial_weights(record, jax.random.key(0)).items():
+        if name.startswith("classifier.") and name.endswith(".kernel"):
+            spread = np.asarray(kernel).std() * np.prod(kernel.shape[:3]) ** 0.5
+            assert abs(spread - 1) < 0.3, name
 
 
 QUICK_STRIDES = [(torch_architecture, 8, "mobilenet_v2"), (torch_architecture, 16, "efficientnet_lite0")]
