@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from jaxmap.errors import JaxmapError
 
 Kind = Literal["deeplab", "fcn", "segnet", "unet"]
-Backbone = Literal["mobilenet_v2", "efficientnet_lite0", "resnet18", "resnet50", "resnet101", "xception65"]
+Backbone = Literal["mobilenet_v2", "efficientnet_lite0", "resnet18", "resnet50", "resnet101", "xception65", "vgg16"]
 Padding = Literal["torch", "same"]
 Norm = Literal["batch", "bias", "none"]
 Activation = Literal["relu", "relu6", "none"]

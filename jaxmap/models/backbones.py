@@ -1,6 +1,6 @@
 """Networks without their classifiers, as feature extractors.
 
-MobileNetV2, EfficientNet-Lite0, ResNet-18, 50 and 101, Xception-65.
+MobileNetV2, EfficientNet-Lite0, ResNet-18, 50 and 101, Xception-65, VGG-16.
 
 Each gives the last features at every stride, down to the output stride (`Pyramid`). For SegNet, strides are replaced by
 max pooling of 2 x 2 pixels; the weights are the same.
@@ -68,6 +68,9 @@ BOTTLENECK_GROWTH = 4
 XCEPTION_ENTRY = ((128, 128, 128), (256, 256, 256), (728, 728, 728))
 XCEPTION_MIDDLE = ((728, 728, 728),) * 16
 XCEPTION_EXIT = ((728, 1024, 1024), (1536, 1536, 2048))
+
+VGG_STAGES = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+"""Channels and convolutions of each stage (Simonyan and Zisserman 2015, table 1, D)."""
 
 
 class Pyramid(NamedTuple):
@@ -415,9 +418,45 @@ class Xception65(nnx.Module):
         return follow.ending(images)
 
 
-BUILDERS: dict[str, Callable[[Architecture], InvertedResidualNet | ResNet | Xception65]] = {
+class Vgg16(nnx.Module):
+    """The convolutions of VGG-16 (Simonyan and Zisserman 2015) with batch norm, as in the papers on SegNet and FCN.
+
+    Each stage ends in max pooling of 2 x 2 pixels; where the output stride forbids it, later stages are dilated.
+    """
+
+    def __init__(self, record: Architecture) -> None:
+        common, self.record = _conventions(record), record
+        stages, halving, inputs, stride, rate = [], [], 3, 1, 1
+        for channels, count in VGG_STAGES:
+            stages.append(
+                nnx.List(
+                    ConvBlock(channels if index else inputs, channels, 3, dilation=rate, **common)
+                    for index in range(count)
+                )
+            )
+            halving.append(2 * stride <= record.output_stride)
+            stride, rate, inputs = (2 * stride, rate, channels) if halving[-1] else (stride, 2 * rate, channels)
+        self.stages, self.halving = nnx.List(stages), tuple(halving)
+        self.pooled = tuple(channels for (channels, _), halves in zip(VGG_STAGES, halving, strict=True) if halves)
+        # What is first pooled has stride 1.
+        self.channels = _from_finest([*self.pooled[1:], inputs], record)
+
+    def __call__(self, images: Float[Array, "B H W 3"]) -> Pyramid:
+        """The features at every stride."""
+        follow = _Halving(self.record)
+        for stage, halves in zip(self.stages, self.halving, strict=True):
+            for block in stage:
+                images = block(images)
+            if halves:
+                follow.before(images)
+                images = follow.after(images if follow.pools else max_pool(images, size=2))
+        return follow.ending(images)
+
+
+BUILDERS: dict[str, Callable[[Architecture], InvertedResidualNet | ResNet | Xception65 | Vgg16]] = {
     **dict.fromkeys(INVERTED_RESIDUAL_STAGES, InvertedResidualNet),
     **dict.fromkeys(RESNET_UNITS, ResNet),
     "xception65": Xception65,
+    "vgg16": Vgg16,
 }
 """What builds each backbone. It has `channels`, of its levels, and `pooled`, those of each max pooling."""

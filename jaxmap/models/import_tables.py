@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.backbones import INVERTED_RESIDUAL_STAGES, RESNET_UNITS
+from jaxmap.models.backbones import INVERTED_RESIDUAL_STAGES, RESNET_UNITS, VGG_STAGES
 
 
 class Row(NamedTuple):
@@ -108,8 +108,20 @@ def torchvision_resnet(backbone: str, prefix: str = "") -> Iterator[Row]:
                 yield Row(f"{ours}.shortcut", f"{theirs}.downsample.0", f"{theirs}.downsample.1")
 
 
+def torchvision_vgg16(prefix: str = "") -> Iterator[Row]:
+    """`features.N` of torchvision's `vgg16_bn`: convolution, norm and ReLU in turn, a pooling after each stage."""
+    place = 0
+    for stage, (_, count) in enumerate(VGG_STAGES):
+        for index in range(count):
+            yield Row(f"backbone.stages.{stage}.{index}", f"{prefix}features.{place}", f"{prefix}features.{place + 1}")
+            place += 3
+        place += 1
+
+
 def torchvision_backbone(backbone: str, prefix: str = "") -> Iterator[Row]:
     """The rows of a backbone under torchvision's names."""
+    if backbone == "vgg16":
+        return torchvision_vgg16(prefix)
     if backbone == "mobilenet_v2":
         return torchvision_mobilenet_v2(prefix)
     return torchvision_resnet(backbone, prefix)

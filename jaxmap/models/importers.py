@@ -294,6 +294,19 @@ def _from_torch_backbone(file: _Checkpoint) -> ImportedWeights:
     return file.convert(f"{family} {backbone} backbone", architecture, rows, holds="backbone", ignored=ignored)
 
 
+def _from_vgg(file: _Checkpoint) -> ImportedWeights:
+    architecture = torch_architecture("vgg16", file.classes or ROVER_CLASSES, output_stride=file.stride)
+    rows, tensors = list(torchvision_backbone("vgg16")), dict(file.tensors)
+    # Batch norm follows convolutions that have a bias, too: (x + b) - mean is x - (mean - b).
+    for row in rows:
+        bias, mean = (tensors.get(name) for name in (f"{row.convolution}.bias", f"{row.norm}.running_mean"))
+        if bias is not None and mean is not None and bias.shape == mean.shape:
+            del tensors[f"{row.convolution}.bias"]
+            tensors[f"{row.norm}.running_mean"] = as_float32(mean) - as_float32(bias)
+    file = file._replace(tensors=tensors)
+    return file.convert("torchvision vgg16_bn backbone", architecture, rows, holds="backbone", ignored=("classifier.",))
+
+
 def _from_efficientnet(file: _Checkpoint) -> ImportedWeights:
     architecture = torch_architecture("efficientnet_lite0", file.classes or ROVER_CLASSES, output_stride=file.stride)
     name = "efficientnet_lite0 backbone"
@@ -349,6 +362,7 @@ SOURCES = (
         lambda names: "features.0.0.weight" in names or "layer1.0.conv1.weight" in names,
         _from_torch_backbone,
     ),
+    _Source("torchvision vgg16_bn", lambda names: "features.0.weight" in names, _from_vgg),
     _Source("TensorFlow folded mobilenet_v2 and DeepLabv3", lambda names: "Conv/kernel" in names, _from_tf_folded),
 )
 """Every kind that is recognised, the most particular first."""

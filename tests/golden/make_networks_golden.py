@@ -1,6 +1,7 @@
-"""Writes networks_golden.npz: what torchvision's FCN and segmentation_models_pytorch's Unet say of seeded images.
+"""Writes networks_golden.npz: what torchvision's FCN, segmentation_models_pytorch's Unet and a SegNet of torch's say.
 
-Needs torch (CPU), torchvision and segmentation_models_pytorch, whose own networks are run with seeded weights.
+Needs torch (CPU), torchvision and segmentation_models_pytorch, whose own networks are run on a seeded image with seeded
+weights; the SegNet is torchvision's VGG-16 and torch's own unpooling.
 """
 
 from __future__ import annotations
@@ -27,7 +28,46 @@ def fcn(backbone: str) -> torch.nn.Module:
     return make(weights=None, weights_backbone=None, num_classes=CLASSES, aux_loss=False)
 
 
+class SegNet(torch.nn.Module):
+    """Pooling that tells its indices, and its mirror."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features = torchvision.models.vgg16_bn(weights=None).features
+        for layer in self.features:
+            if isinstance(layer, torch.nn.MaxPool2d):
+                layer.return_indices = True
+        widths = (512, 512, 256, 128, 64)
+        steps = [
+            [self.block(width, width), *([self.block(width, after)] if after else [])]
+            for width, after in zip(widths, (*widths[1:], 0), strict=True)
+        ]
+        self.decoder = torch.nn.ModuleList(torch.nn.Sequential(*step) for step in steps)
+        self.classifier = torch.nn.Conv2d(64, CLASSES, 3, padding=1)
+
+    @staticmethod
+    def block(inputs: int, outputs: int) -> torch.nn.Module:
+        conv = torch.nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+        return torch.nn.Sequential(conv, torch.nn.BatchNorm2d(outputs), torch.nn.ReLU())
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        indices = []
+        for layer in self.features:
+            x = layer(x)
+            if isinstance(layer, torch.nn.MaxPool2d):
+                x, places = x
+                indices.append(places)
+        for step in self.decoder:
+            x = step(torch.nn.functional.max_unpool2d(x, indices.pop(), 2))
+        return self.classifier(x)
+
+
+def segnet(backbone: str) -> torch.nn.Module:
+    return SegNet()
+
+
 CASES = (
+    ("segnet", segnet, "vgg16"),
     ("unet", unet, "mobilenet_v2"),
     ("unet", unet, "resnet18"),
     ("unet", unet, "resnet50"),

@@ -1,4 +1,4 @@
-"""The same numbers as torchvision's own FCN and segmentation_models_pytorch's own Unet, through the importers."""
+"""The same numbers as torchvision's own FCN, segmentation_models_pytorch's own Unet and a SegNet of torch's layers."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from golden.seeded_weights import seeded_image, seeded_state
 from safetensors.numpy import save_file
 
 from jaxmap.errors import JaxmapError
+from jaxmap.models.architecture import torch_architecture
+from jaxmap.models.checkpoint import check_weights
+from jaxmap.models.import_tables import TORCH, Row
 from jaxmap.models.importers import import_weights
 from jaxmap.models.network import inference_network
 
@@ -19,12 +22,18 @@ GOLDEN = Path(__file__).parent.parent / "golden" / "networks_golden.npz"
 SIZE, STEP = (64, 96), 3
 
 
-def checkpoint(key: str, path: Path, **changes: np.ndarray) -> Path:
+def state_of(key: str) -> dict[str, np.ndarray]:
     """Seeded weights under the names of the torch network."""
     with np.load(GOLDEN) as golden:
         lines = str(golden[f"names/{key}"]).splitlines()
-    shapes = {name: tuple(ast.literal_eval(shape)) for name, _, shape in (line.partition(" ") for line in lines)}
-    save_file(seeded_state(shapes) | changes, path)
+    return seeded_state(
+        {name: tuple(ast.literal_eval(shape)) for name, _, shape in (line.partition(" ") for line in lines)}
+    )
+
+
+def checkpoint(key: str, path: Path, **changes: np.ndarray) -> Path:
+    """The same as a file."""
+    save_file(state_of(key) | changes, path)
     return path
 
 
@@ -48,6 +57,33 @@ def test_logits_equal_those_of_torch(key, name, stride, tmp_path):
         expected, labels = golden[f"logits/{key}"], golden[f"labels/{key}"]
     np.testing.assert_allclose(logits[::STEP, ::STEP], expected, atol=1e-3, rtol=0)
     assert ((logits - logits.mean(axis=(0, 1))).argmax(axis=-1) == labels).mean() >= 0.999
+
+
+@pytest.mark.slow
+def test_logits_of_segnet_equal_those_of_torch_and_its_encoder_is_imported(tmp_path):
+    state = state_of("segnet_vgg16")
+    save_file(
+        {name: value for name, value in state.items() if name.startswith("features.")}, tmp_path / "a.safetensors"
+    )
+    imported = import_weights(tmp_path / "a.safetensors")
+    assert imported.holds == "backbone" and imported.architecture.backbone == "vgg16"
+    weights = dict(imported.weights)
+    rows = [
+        Row(f"decoder.{step}.{index}", f"decoder.{step}.{index}.0", f"decoder.{step}.{index}.1")
+        for step, count in enumerate((2, 2, 2, 2, 1))
+        for index in range(count)
+    ]
+    for row in [*rows, Row("classifier", "classifier")]:
+        weights[f"{row.block}.kernel"] = state[f"{row.convolution}.weight"].transpose(TORCH.transpose)
+        for leaf, suffix in TORCH.norm.items() if row.norm else ():
+            weights[f"{row.block}.norm.{leaf}"] = state[row.norm + suffix]
+    weights["classifier.bias"] = state["classifier.bias"]
+    record = torch_architecture("vgg16", ("a", "b", "c"), kind="segnet")
+    check_weights(record, weights, where="segnet")
+    network = inference_network(record, weights)
+    logits = np.asarray(jax.jit(network.apply)(network.weights, seeded_image(*SIZE)[None])[0])
+    with np.load(GOLDEN) as golden:
+        np.testing.assert_allclose(logits[::STEP, ::STEP], golden["logits/segnet_vgg16"], atol=1e-3, rtol=0)
 
 
 def test_an_attention_that_is_not_ours_and_another_stride_are_refused(tmp_path):
