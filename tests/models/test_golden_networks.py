@@ -83,7 +83,7 @@ def test_logits_of_segnet_equal_those_of_torch_and_its_encoder_is_imported(tmp_p
     network = inference_network(record, weights)
     logits = np.asarray(jax.jit(network.apply)(network.weights, seeded_image(*SIZE)[None])[0])
     with np.load(GOLDEN) as golden:
-        np.testing.assert_allclose(logits[::STEP, ::STEP], golden["logits/segnet_vgg16"], atol=1e-3, rtol=0)
+        np.testing.assert_allclose(logits[::STEP, ::STEP], golden["logits/segnet_vgg16"], atol=1e-5, rtol=0)
 
 
 def test_an_attention_that_is_not_ours_and_another_stride_are_refused(tmp_path):
