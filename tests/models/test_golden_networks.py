@@ -76,7 +76,7 @@ def test_logits_of_segnet_equal_those_of_torch_and_its_encoder_is_imported(tmp_p
     for row in [*rows, Row("classifier", "classifier")]:
         weights[f"{row.block}.kernel"] = state[f"{row.convolution}.weight"].transpose(TORCH.transpose)
         for leaf, suffix in TORCH.norm.items() if row.norm else ():
-            weights[f"{row.block}.norm.{leaf}"] = state[row.norm + suffix]
+            weights[f"{row.block}.norm.{leaf}"] = state[f"{row.norm}{suffix}"]
     weights["classifier.bias"] = state["classifier.bias"]
     record = torch_architecture("vgg16", ("a", "b", "c"), kind="segnet")
     check_weights(record, weights, where="segnet")
