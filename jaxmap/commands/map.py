@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Interval
 
 from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.errors import UsageError
@@ -45,6 +46,8 @@ class MapArguments:
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
     TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
+    devices: Annotated[int, Interval(ge=1)] | None = None
+    """On how many GPUs frames are fused, one on each at a time; by default on all. A CPU is one device."""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
 
 
@@ -84,6 +87,7 @@ def main(words: Sequence[str]) -> int:
             notify=console.notify,
             on_frame=advance,
             profile=arguments.profile,
+            devices=arguments.devices,
         )
     console.notify(summary(metrics))
     for skipped in metrics["sequence"]["skipped"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from jaxmap.geometry.bounds import map_bytes, view_boxes
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.attributes import MapAttributes
+from jaxmap.mapping.devices import choose_devices, run_on_devices
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
 from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import MovingBlock, TileStore
@@ -43,6 +44,7 @@ def run_plan(
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
     profile: bool = False,
     report: bool = True,
+    devices: int | None = None,
 ) -> dict[str, Any]:
     """Maps the sequence and writes all outputs.
 
@@ -58,6 +60,7 @@ def run_plan(
         on_frame: called after each frame.
         profile: record a trace of some steps into the folder, and report where their time went.
         report: write the page of the run.
+        devices: how many are mapped on; by default all GPUs, or one CPU.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -65,6 +68,7 @@ def run_plan(
     Raises:
         JaxmapError: no frame could be fused, or an output cannot be written.
     """
+    chosen = choose_devices(devices, plan.members)
     memory = _TiledMap(plan, folder.map) if plan.block_shape else _WholeMap(plan, folder.map)
     voxel_map, log = memory.begin()
     if log.complete:
@@ -81,10 +85,12 @@ def run_plan(
         pose_errors=plan.pose_errors,
         first=log.next_index,
     )
-    form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
-    run = run_sequence(
-        plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form, cover=memory.cover
-    )
+    words: tuple[Any, ...] = (plan.mapper, voxel_map, frames, plan.params, plan.key)
+    if len(chosen) > 1:
+        run = run_on_devices(*words, devices=chosen, strict=strict, cover=memory.cover)
+    else:
+        form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
+        run = run_sequence(*words, strict=strict, form=form, cover=memory.cover)
     key_frames: list[tuple[PreparedFrame, int]] = []
     try:
         for voxel_map, fused in run:
@@ -96,12 +102,14 @@ def run_plan(
                 resumed_s += fused.cost.compile_s
             if fused.info is not None and fused.prepared.index in plan.key_frames:
                 # Pictures wait for the next save; noted before the frame counts, so that an interrupt loses none.
-                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
+                key_frames.append((fused.prepared, log.fused))
             log.add(fused, _disparity_scores(plan, fused))
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
-            if time.perf_counter() - saved_s > checkpoint_every_s:
+            # A map that several devices have made holds the frames of its batch, which are counted one by one.
+            whole = len(chosen) == 1 or int(voxel_map.frames_fused) == log.fused
+            if whole and time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 _save(plan, folder, log, memory, voxel_map, key_frames)
                 saved_s = resumed_s = time.perf_counter()
@@ -119,7 +127,9 @@ def run_plan(
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    reader = memory.save(voxel_map, _attributes(plan, log, voxel_map))
+    attributes = _attributes(plan, log, voxel_map)
+    memory.save(voxel_map, attributes)
+    reader = memory.reader(voxel_map, attributes)
     metrics = _write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
@@ -143,13 +153,16 @@ class _WholeMap:
         _check_same(self.plan, voxel_map, log, self.path)
         return voxel_map, log
 
-    def cover(self, voxel_map: VoxelMap, index: int) -> VoxelMap:
+    def cover(self, voxel_map: VoxelMap, indices: Sequence[int]) -> VoxelMap:
         """It holds the view of any frame."""
         return voxel_map
 
-    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> None:
         """Writes the map."""
         save_map(self.path, voxel_map, attributes)
+
+    def reader(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """The whole map, once it is saved."""
         return in_memory(voxel_map, attributes)
 
 
@@ -171,16 +184,19 @@ class _TiledMap:
         _check_same(self.plan, replace(voxel_map, grid=stored.grid), log, self.path)
         return voxel_map, log
 
-    def cover(self, voxel_map: VoxelMap, index: int) -> VoxelMap:
-        """The block, where it holds the view of a frame."""
-        return self.block.cover(voxel_map, self.boxes[index])
+    def cover(self, voxel_map: VoxelMap, indices: Sequence[int]) -> VoxelMap:
+        """The block, where it holds the views of frames."""
+        return self.block.cover(voxel_map, self.boxes[list(indices)])
 
-    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> None:
         """Writes the tiles that have changed, and the attributes, all at once."""
         self.block.write_changes(voxel_map)
         self.block.store.commit(int(voxel_map.frames_fused), attributes)
         if attributes.progress.get("complete"):
             self.block.store.close()
+
+    def reader(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """The whole map, once it is saved; to open it lists its tiles, which takes seconds where they are many."""
         return open_map(self.path)
 
 
