@@ -16,12 +16,13 @@ from .geometry.options import GroundOptions
 from .geometry.plane import fit_plane_mlesac, plane_distance
 from .geometry.relief import Relief, relief_channels, relief_of
 from .labellers.base import Labeller, LabellerParams, make_no_labeller
-from .labellers.deeplab import make_deeplab_labeller
+from .labellers.deeplab import make_deeplab_labeller, make_logits_labeller
 from .labellers.files import make_files_labeller
 from .labellers.options import DeeplabOptions, PlaneOptions, ReliefOptions
 from .labellers.plane import make_plane_labeller
 from .labellers.relief import combine_with_relief, make_relief_labeller
 from .labels import IGNORE, ROVER_CLASSES
+from .mapping.observations import Observations, open_observations
 from .mapping.sequence import prepare_frames, run_sequence
 from .mapping.step import Mapper, MapperParams, make_mapper
 from .mapping.store import MapAttributes, load_map, save_map
@@ -68,6 +69,7 @@ __all__ = [
     "MapAttributes",
     "Mapper",
     "MapperParams",
+    "Observations",
     "Plane",
     "PlaneOptions",
     "PointCloud",
@@ -103,6 +105,7 @@ __all__ = [
     "make_files_labeller",
     "make_fusion_params",
     "make_grid",
+    "make_logits_labeller",
     "make_mapper",
     "make_network",
     "make_no_labeller",
@@ -114,6 +117,7 @@ __all__ = [
     "make_voxel_map",
     "map_gradient",
     "occupancy_probability",
+    "open_observations",
     "open_sequence",
     "plane_distance",
     "points_to_pixels",

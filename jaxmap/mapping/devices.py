@@ -21,7 +21,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.fusion.integrate import add_evidence
 from jaxmap.host.stages import timed_stage
-from jaxmap.mapping.sequence import Cover, FusedFrame, PreparedFrame, timed_frames
+from jaxmap.mapping.sequence import Cover, FusedFrame, PreparedFrame, run_sequence, timed_frames
 from jaxmap.mapping.step import Mapper, MapperParams, StepReport, check_inputs, compile_step, see_frame, with_step
 from jaxmap.types import Frame, VoxelMap, to_device
 
@@ -106,12 +106,16 @@ def run_on_devices(
     frames: Iterable[PreparedFrame],
     params: MapperParams,
     key: PRNGKeyArray,
-    *,
     devices: Sequence[Device],
+    *,
     strict: bool = False,
+    form: Frame | None = None,
     cover: Cover = lambda voxel_map, indices: voxel_map,
 ) -> Iterator[tuple[VoxelMap, FusedFrame]]:
     """As `sequence.run_sequence`, in batches: with each frame of a batch comes the map that holds all of the batch."""
+    if len(devices) == 1:
+        yield from run_sequence(mapper, voxel_map, frames, params, key, strict=strict, form=form, cover=cover)
+        return
     mapper, cost = on_devices(mapper, devices), None
     mesh = Mesh(np.array(devices), (_AXIS,))
     everywhere = NamedSharding(mesh, P())

@@ -18,20 +18,32 @@ from jaxmap.geometry.bounds import map_bytes, view_boxes
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.attributes import MapAttributes
-from jaxmap.mapping.devices import choose_devices, run_on_devices
-from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
+from jaxmap.mapping.devices import Device, choose_devices, run_on_devices
+from jaxmap.mapping.sequence import FusedFrame, PreparedFrame
 from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import MovingBlock, TileStore
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.checking import finding_line, findings_tree
-from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
+from jaxmap.runs.exports import write_exports
+from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_key_frame, write_poses
+from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import RunLog
-from jaxmap.runs.mapping_plan import Notify, Plan
+from jaxmap.runs.mapping_plan import Plan
+from jaxmap.runs.run_frames import write_frame_table
 from jaxmap.types import VoxelMap
 
+_PICTURES_AT_ONCE = 4
+"""Frames that wait for their pictures to be written; each holds some 10 MB."""
 FEW_MATCHED = 0.01
 """Where fewer pixels of a frame have a depth in range, it is not the bounds that leave a map empty."""
+
+Watch = Callable[[FusedFrame, VoxelMap], None]
+"""Looks at the map after each frame; the next frame takes the map's memory."""
+
+
+def unwatched(fused: FusedFrame, voxel_map: VoxelMap) -> None:
+    """Looks at nothing."""
 
 
 def run_plan(
@@ -42,9 +54,10 @@ def run_plan(
     checkpoint_every_s: float,
     notify: Notify,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
+    watch: Watch = unwatched,
     profile: bool = False,
     report: bool = True,
-    devices: int | None = None,
+    devices: Sequence[Device] | None = None,
 ) -> dict[str, Any]:
     """Maps the sequence and writes all outputs.
 
@@ -58,9 +71,10 @@ def run_plan(
         checkpoint_every_s: how often the map is saved on the way.
         notify: takes lines for the user.
         on_frame: called after each frame.
+        watch: looks at the map after each frame (`viewing.live_view`).
         profile: record a trace of some steps into the folder, and report where their time went.
         report: write the page of the run.
-        devices: how many are mapped on; by default all GPUs, or one CPU.
+        devices: of `mapping.devices.choose_devices`, by default its default.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -68,30 +82,21 @@ def run_plan(
     Raises:
         JaxmapError: no frame could be fused, or an output cannot be written.
     """
-    chosen = choose_devices(devices, plan.members)
+    devices = devices or choose_devices(None, plan.members)
     memory = _TiledMap(plan, folder.map) if plan.block_shape else _WholeMap(plan, folder.map)
     voxel_map, log = memory.begin()
-    if log.complete:
-        notify("the run is complete already; its outputs are written anew")
-    elif log.next_index:
-        notify(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
+    _tell_progress(plan, log, notify)
     step_profile, program = StepProfile(folder.profile if profile else None), None
     saved_s = resumed_s = time.perf_counter()
-    frames = prepare_frames(
-        plan.sequence,
-        plan.front_end,
-        plan.label_folder,
-        needs=plan.labeller.needs,
-        pose_errors=plan.pose_errors,
-        first=log.next_index,
-    )
+    if plan.keeper is not None:
+        plan.keeper.begin(folder.observations)
+    frames = plan.prepare(log.next_index, keep_in=folder.observations)
+    form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
     words: tuple[Any, ...] = (plan.mapper, voxel_map, frames, plan.params, plan.key)
-    if len(chosen) > 1:
-        run = run_on_devices(*words, devices=chosen, strict=strict, cover=memory.cover)
-    else:
-        form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
-        run = run_sequence(*words, strict=strict, form=form, cover=memory.cover)
-    key_frames: list[tuple[PreparedFrame, int]] = []
+    run = run_on_devices(
+        *words, devices=choose_devices(devices, plan.members), strict=strict, form=form, cover=memory.cover
+    )
+    pictures = _Pictures(plan, folder)
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
@@ -100,42 +105,46 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
-            if fused.info is not None and fused.prepared.index in plan.key_frames:
-                # Pictures wait for the next save; noted before the frame counts, so that an interrupt loses none.
-                key_frames.append((fused.prepared, log.fused))
+            pictures.note(fused, log.fused)
             log.add(fused, _disparity_scores(plan, fused))
+            resumed_s += pictures.write_many()
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
-            # A map that several devices have made holds the frames of its batch, which are counted one by one.
-            whole = len(chosen) == 1 or int(voxel_map.frames_fused) == log.fused
-            if whole and time.perf_counter() - saved_s > checkpoint_every_s:
+            watch(fused, voxel_map)
+            # A map that several devices have made holds all of a batch, whose frames are counted one by one.
+            if int(voxel_map.frames_fused) == log.fused and time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
-                _save(plan, folder, log, memory, voxel_map, key_frames)
+                _save(plan, log, memory, voxel_map, pictures)
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
-            _save(plan, folder, log, memory, voxel_map, key_frames)
+            _save(plan, log, memory, voxel_map, pictures)
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
         step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
-    _write_key_frames(plan, folder, key_frames)
+    pictures.write()
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    attributes = _attributes(plan, log, voxel_map)
-    memory.save(voxel_map, attributes)
-    reader = memory.reader(voxel_map, attributes)
+    reader = memory.finish(voxel_map, _attributes(plan, log, voxel_map))
     metrics = _write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
     for note in _notes(plan, log, metrics):
         notify(f"note: {note}")
     return metrics
+
+
+def _tell_progress(plan: Plan, log: RunLog, notify: Notify) -> None:
+    if log.complete:
+        notify("the run is complete already; its outputs are written anew")
+    elif log.next_index:
+        notify(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
 
 
 class _WholeMap:
@@ -161,8 +170,9 @@ class _WholeMap:
         """Writes the map."""
         save_map(self.path, voxel_map, attributes)
 
-    def reader(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
-        """The whole map, once it is saved."""
+    def finish(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """Writes the map for good, and opens it."""
+        self.save(voxel_map, attributes)
         return in_memory(voxel_map, attributes)
 
 
@@ -192,24 +202,17 @@ class _TiledMap:
         """Writes the tiles that have changed, and the attributes, all at once."""
         self.block.write_changes(voxel_map)
         self.block.store.commit(int(voxel_map.frames_fused), attributes)
-        if attributes.progress.get("complete"):
-            self.block.store.close()
 
-    def reader(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
-        """The whole map, once it is saved; to open it lists its tiles, which takes seconds where they are many."""
+    def finish(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """Writes the map for good, and opens it, which lists its tiles: seconds where they are many."""
+        self.save(voxel_map, attributes)
+        self.block.store.close()
         return open_map(self.path)
 
 
-def _save(
-    plan: Plan,
-    folder: RunFolder,
-    log: RunLog,
-    memory: _WholeMap | _TiledMap,
-    voxel_map: VoxelMap,
-    key_frames: list[tuple[PreparedFrame, int]],
-) -> None:
+def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: _Pictures) -> None:
     """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
-    _write_key_frames(plan, folder, key_frames)
+    pictures.write()
     memory.save(voxel_map, _attributes(plan, log, voxel_map))
 
 
@@ -267,12 +270,15 @@ def _write_outputs(
     plan: Plan, folder: RunFolder, log: RunLog, reader: MapReader, details: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes all that a run leaves beside its map, and returns its metrics, the details among them."""
-    skipped = {frame["frame"] for frame in log.skipped}
+    skipped = {frame["frame"]: frame["reason"] for frame in log.skipped}
+    if plan.keeper is not None:
+        plan.keeper.finish(folder.observations, skipped)
     fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
+    write_frame_table(folder.frames, plan.sequence.frames, skipped)
     write_exports(folder, reader)
     metrics = _metrics(plan, log, reader) | count_missed(plan.rule, reader, plan.members) | details
     write_json(folder.metrics, metrics)
@@ -328,15 +334,37 @@ def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
     )
 
 
-def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[PreparedFrame, int]]) -> None:
-    """Writes pictures of frames, with the labels that the step gave each as the so manieth, and empties the list."""
-    for prepared, number in key_frames:
-        assert prepared.frame is not None and prepared.rectified is not None
-        labels = None
-        if plan.labeller.classes:
-            labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
-        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
-    key_frames.clear()
+class _Pictures:
+    """Key frames that wait for their pictures to be written."""
+
+    def __init__(self, plan: Plan, folder: RunFolder) -> None:
+        self.plan, self.folder = plan, folder
+        self.waiting: list[tuple[PreparedFrame, int]] = []
+
+    def note(self, fused: FusedFrame, number: int) -> None:
+        """Keeps a key frame, before which so many were fused; before it counts, so that an interrupt loses none."""
+        if fused.info is not None and fused.prepared.index in self.plan.key_frames:
+            self.waiting.append((fused.prepared, number))
+
+    def write_many(self) -> float:
+        """Writes pictures where many wait, and returns how long that took, in seconds."""
+        if len(self.waiting) < _PICTURES_AT_ONCE:
+            return 0.0
+        started_s = time.perf_counter()
+        self.write()
+        return time.perf_counter() - started_s
+
+    def write(self) -> None:
+        """Writes all, with the labels that the step gave each frame as the so manieth."""
+        plan = self.plan
+        for prepared, number in self.waiting:
+            assert prepared.frame is not None and prepared.rectified is not None
+            labels = None
+            if plan.labeller.classes:
+                labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
+            large = plan.key_frames[prepared.index]
+            write_key_frame(self.folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
+        self.waiting.clear()
 
 
 def _metrics(plan: Plan, log: RunLog, reader: MapReader) -> dict[str, Any]:
@@ -368,13 +396,14 @@ def _metrics(plan: Plan, log: RunLog, reader: MapReader) -> dict[str, Any]:
         | {
             "width_px": camera.width_px,
             "height_px": camera.height_px,
-            "rectified_here": plan.front_end.rectifier is not None,
+            "rectified_here": plan.front_end.rectified_here,
             **({} if (turn := plan.front_end.alignment_rad) is None else {"alignment_rad": turn.round(8).tolist()}),
             # Poses of the rectified camera, relative to the site origin.
             "key_frames": {
                 f"{index:06d}": (sequence.T_world_camera[index] @ plan.front_end.T_raw_rectified).round(6).tolist()
-                for index in sorted(plan.key_frames)
+                for index in plan.key_frames
             },
+            "T_raw_rectified": plan.front_end.T_raw_rectified.round(9).tolist(),
         },
         "grid": {
             "shape": list(grid.shape),

@@ -22,6 +22,7 @@ import sys
 from pathlib import Path
 
 import jax
+from jaxmap.mapping.devices import choose_devices
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping import run_plan
 from jaxmap.runs.mapping_plan import plan_run
@@ -35,7 +36,7 @@ for devices in (1, 2):
     folder = RunFolder(out / str(devices))
     folder.begin(plan.settings(config), resume=False, overwrite=False)
     # Saved whenever that is allowed: map and log must agree.
-    options = dict(checkpoint_every_s=0.0, notify=print, report=False, devices=devices)
+    options = dict(checkpoint_every_s=0.0, notify=print, report=False, devices=choose_devices(devices))
     run_plan(plan, folder, strict=False, **options)
 """
 
