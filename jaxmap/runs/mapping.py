@@ -92,10 +92,8 @@ def run_plan(
         plan.keeper.begin(folder.observations)
     frames = plan.prepare(log.next_index, keep_in=folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
-    words: tuple[Any, ...] = (plan.mapper, voxel_map, frames, plan.params, plan.key)
-    run = run_on_devices(
-        *words, devices=choose_devices(devices, plan.members), strict=strict, form=form, cover=memory.cover
-    )
+    options: dict[str, Any] = {"strict": strict, "form": form, "cover": memory.cover}
+    run = run_on_devices(plan.mapper, voxel_map, frames, plan.params, plan.key, devices, **options)
     pictures = _Pictures(plan, folder)
     try:
         for voxel_map, fused in run:
