@@ -5,6 +5,7 @@ from __future__ import annotations
 COMMANDS: dict[str, str] = {
     "demo": "map the bundled sample with every labeller and compare the scores",
     "check": "say what is wrong with a sequence before it is mapped",
+    "perceive": "match and label every frame once, and keep what was seen",
     "map": "map a stereo sequence",
     "train": "train or fine-tune DeepLabv3+ on images and masks",
     "refine": "refine poses, camera mounting and stereo calibration until frames agree",

@@ -13,7 +13,7 @@ import tyro
 from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import NotNegative
-from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.config import MapConfig, config_of_observations, load_config, observations_in
 
 OUTPUTS = (
     *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
@@ -23,7 +23,7 @@ OUTPUTS = (
 
 @dataclass(frozen=True)
 class MapArguments:
-    """Map a stereo sequence: images and poses in, a voxel map and its pictures out.
+    """Map a stereo sequence, or what jaxmap perceive has kept of one, into a voxel map and its pictures.
 
     Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
     poses.tum, pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and
@@ -31,7 +31,8 @@ class MapArguments:
     """
 
     sequence: tyro.conf.Positional[str]
-    """Folder of one sequence, a ROS bag, or sample:motorcycle."""
+    """Folder of one sequence, a ROS bag, or sample:motorcycle; or a folder of observations, whose settings then are the
+    defaults."""
     out: Path
     """The run folder to write; not the sequence's own folder."""
     config: str | None = None
@@ -40,6 +41,8 @@ class MapArguments:
     """Resume an interrupted run."""
     overwrite: bool = False
     """Replace a run that lies in the folder; it stays until the new one is whole."""
+    keep_observations: bool = False
+    """Keep what is perceived on the way as observations.zarr in the run folder, as jaxmap perceive does."""
     checkpoint_every_s: Annotated[float, NotNegative] = 30.0
     """How often the map is saved on the way."""
     profile: bool = False
@@ -51,6 +54,10 @@ class MapArguments:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(MapArguments, "map", words, with_config=_with_config)
+    if (perceived := observations_in(arguments.sequence)) is not None:
+        arguments = parse(MapArguments, "map", words, default=_on(perceived, arguments.config))
+        if arguments.keep_observations:
+            raise UsageError("--keep-observations keeps those of a sequence", where=perceived, fix="leave it out")
     config = arguments.settings
     if arguments.resume and arguments.overwrite:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
@@ -68,7 +75,8 @@ def main(words: Sequence[str]) -> int:
     console = Console()
     folder = RunFolder(arguments.out)
     with console.counted("odometry", "frames") as on_frame:
-        plan = plan_run(arguments.sequence, config, console.notify, on_frame)
+        keep = arguments.keep_observations
+        plan = plan_run(arguments.sequence, config, console.notify, on_frame, keep=keep)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite
     with (
@@ -89,7 +97,8 @@ def main(words: Sequence[str]) -> int:
     for skipped in metrics["sequence"]["skipped"]:
         console.notify(f"skipped {skipped['frame']}: {skipped['reason']}")
     missed, profile = ["missed.png"] if config.ensemble.members else [], ["profile/"] if arguments.profile else []
-    console.result(arguments.out, (*OUTPUTS, *missed, *profile))
+    kept = ["observations.zarr"] if keep else []
+    console.result(arguments.out, (*OUTPUTS, *kept, *missed, *profile))
     return 0
 
 
@@ -106,3 +115,9 @@ def summary(metrics: dict) -> str:
 def _with_config(name: str) -> MapArguments:
     """The defaults under a configuration; the two required arguments are filled in by the parser."""
     return MapArguments(sequence=tyro.MISSING, out=tyro.MISSING, config=name, settings=load_config(name))
+
+
+def _on(perceived: Path, name: str | None) -> MapArguments:
+    """The defaults of mapping observations, under a configuration or without."""
+    settings = config_of_observations(perceived, name)
+    return MapArguments(sequence=tyro.MISSING, out=tyro.MISSING, config=name, settings=settings)

@@ -29,6 +29,7 @@ from jaxmap.host.replacement import Replacement
 from jaxmap.mapping.store import MapAttributes, holds_map, load_map, stray_maps
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
 from jaxmap.report.top_down import missed_picture, top_down_picture
+from jaxmap.runs.config import OBSERVATIONS
 from jaxmap.runs.log import RunLog
 from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.types import VoxelMap
@@ -43,6 +44,7 @@ class RunFolder:
         """Names the files; nothing is read or written yet."""
         self.path = path
         self.map = path / "map.zarr"
+        self.observations = path / OBSERVATIONS
         self.ply = path / "map.ply"
         self.geotiff = path / "bev.tif"
         self.picture = path / "bev.png"
@@ -86,7 +88,7 @@ class RunFolder:
         self.settle()
         replacing = RunFolder(self._replacement.new)
         # A run that has failed before its first save has left nothing to lose.
-        used = holds_map(self.map) or self.metrics.exists()
+        used = holds_map(self.map) or self.metrics.exists() or self.observations.exists()
         if resume and (replacing.config.exists() or used):
             work = replacing if replacing.config.exists() else self
             check_same_settings(work.config, dict(settings))
@@ -132,9 +134,10 @@ class RunFolder:
         Raises:
             UsageError: the folder is the sequence's own, or an output would overwrite an input.
         """
-        here = real_path(self.path)
+        here, read = real_path(self.path), real_path(source)
         folders = {real_path(folder) for folder in {image.parent for image in images}}
-        if here == real_path(source) or not folders.isdisjoint((here, *here.parents)):
+        own = here == read or (read.name == OBSERVATIONS and here == read.parent)
+        if own or not folders.isdisjoint((here, *here.parents)):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
         check_inputs_stay(self._files, inputs)
 
@@ -174,7 +177,7 @@ class RunFolder:
 
     def _outputs(self) -> Iterator[Path]:
         """What an earlier run has written, and nothing else."""
-        yield from (self.map, *stray_maps(self.map), self.profile, *self._files)
+        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, *self._files)
         for picture in self.pictures.glob("*.png"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 yield picture

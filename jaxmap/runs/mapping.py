@@ -14,7 +14,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.geometry_scores import DisparityScores, score_disparity
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
-from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
+from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, run_sequence
 from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
@@ -67,14 +67,9 @@ def run_plan(
         notify(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
     step_profile, program = StepProfile(folder.profile if profile else None), None
     saved_s = resumed_s = time.perf_counter()
-    frames = prepare_frames(
-        plan.sequence,
-        plan.front_end,
-        plan.label_folder,
-        needs=plan.labeller.needs,
-        pose_errors=plan.pose_errors,
-        first=log.next_index,
-    )
+    if plan.keeper is not None:
+        plan.keeper.begin(folder.observations)
+    frames = plan.prepare(log.next_index, keep_in=folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
     run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form)
     key_frames: list[tuple[PreparedFrame, int]] = []
@@ -183,7 +178,9 @@ def _write_outputs(
     """Writes all that a run leaves, and returns its metrics, the details among them."""
     attributes = _attributes(plan, log, voxel_map)
     save_map(folder.map, voxel_map, attributes)
-    skipped = {frame["frame"] for frame in log.skipped}
+    skipped = {frame["frame"]: frame["reason"] for frame in log.skipped}
+    if plan.keeper is not None:
+        plan.keeper.finish(folder.observations, skipped)
     fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
@@ -285,7 +282,7 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
         | {
             "width_px": camera.width_px,
             "height_px": camera.height_px,
-            "rectified_here": plan.front_end.rectifier is not None,
+            "rectified_here": plan.front_end.rectified_here,
             **({} if (turn := plan.front_end.alignment_rad) is None else {"alignment_rad": turn.round(8).tolist()}),
             # Poses of the rectified camera, relative to the site origin.
             "key_frames": {
