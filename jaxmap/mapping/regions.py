@@ -41,7 +41,7 @@ from jaxmap.mapping.store import swap_in, sync_tree
 from jaxmap.mapping.tiles import Tile, block_shape, tiles_of
 from jaxmap.types import Frame, GridSpec, VoxelMap, to_device
 
-RECORD = "tiles.json"
+RECORD = f"{LOG_ODDS}/tiles.json"
 """Within a map that was fused in regions: what each of its tiles is made of."""
 
 Shape = tuple[int, int, int]
@@ -155,16 +155,18 @@ def region_shape(
         None where not even the smallest region fits.
     """
     best, best_cost = None, math.inf
-    shape = block_shape(grid, window_shape, channels, limit_bytes)
-    while shape is not None:
-        costs = [len(region.frames) for region in regions_of(grid, shape, touching)]
+    block = block_shape(grid, window_shape, channels, limit_bytes)
+    while block is not None:
+        # As many regions as with these, but of even size.
+        counts = -(-np.array(grid.shape) // block)
+        tiles = np.maximum(-(-np.array(grid.shape) // TILE // counts), -(-np.array(window_shape) // TILE))
+        x, y, z = (tiles * TILE).tolist()
+        costs = [len(region.frames) for region in regions_of(grid, (x, y, z), touching)]
         cost = max(sum(costs) / workers, max(costs, default=0))
         if cost < best_cost:
-            best, best_cost = shape, cost
-        if workers == 1:
-            break
-        smaller = block_shape(grid, window_shape, channels, 2.9 * 4 * channels * math.prod(shape))
-        shape = smaller if smaller != shape else None
+            best, best_cost = (x, y, z), cost
+        smaller = 2.1 * 4 * channels * math.prod(block)
+        block = block_shape(grid, window_shape, channels, smaller) if workers > 1 else None
     return best
 
 
