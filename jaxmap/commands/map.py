@@ -76,7 +76,7 @@ def main(words: Sequence[str]) -> int:
     folder = RunFolder(arguments.out)
     with console.counted("odometry", "frames") as on_frame:
         keep = arguments.keep_observations
-        plan = plan_run(arguments.sequence, config, console.notify, on_frame, keep=keep)
+        plan = plan_run(arguments.sequence, config, console.notify, on_frame, keep=keep, in_tiles=True)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite
     with (

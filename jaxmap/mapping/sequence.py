@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxmap.datasets.base import FrameRef, StereoSequence
-from jaxmap.datasets.images import as_rgb, read_image
+from jaxmap.datasets.images import ImageArray, as_rgb, read_image
 from jaxmap.datasets.label_files import LabelFolder
 from jaxmap.errors import FrameError
 from jaxmap.host.prefetch import prefetch
@@ -112,6 +112,7 @@ def prepare_frames(
 def observed_frames(
     observations: Observations,
     *,
+    left_image: Callable[[FrameRef], ImageArray] | None = None,
     pose_errors: Float[np.ndarray, "N M 6"] | None = None,
     first: int = 0,
     workers: int = 2,
@@ -121,6 +122,8 @@ def observed_frames(
 
     Args:
         observations: the frames and their poses.
+        left_image: reads the rectified left image of a frame, which is then delivered, as RGB, in place of the labels
+            that are kept.
         pose_errors: of the members of an ensemble, for each frame.
         first: index of the first frame.
         workers: threads.
@@ -133,14 +136,21 @@ def observed_frames(
             with timed_stage("read", stages_s):
                 seen = observations.observation(index)
                 prepared = as_prepared(observations, seen, index, pose_errors)
-                picture = observations.picture(index)
-                left = None if picture is None else read_image(picture)
+                picture, left = observations.picture(index), None
+                if left_image is not None:
+                    left = left_image(ref)
+                elif picture is not None:
+                    left = read_image(picture)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
-        assert prepared.rectified is not None
+        assert prepared.rectified is not None and prepared.frame is not None
+        frame, rectified = prepared.frame, prepared.rectified
         if left is not None:
-            prepared = replace(prepared, rectified=prepared.rectified._replace(left=left))
-        return replace(prepared, stages_s=stages_s)
+            rectified = rectified._replace(left=left)
+        if left is not None and left_image is not None:
+            kept: dict[str, Any] = dict.fromkeys(get_args(Needs))
+            frame = replace(frame, **kept | {"image": to_device(as_rgb(left))})
+        return replace(prepared, frame=frame, rectified=rectified, stages_s=stages_s)
 
     return prefetch(prepare, range(first, len(observations.frames)), workers, ahead)
 
@@ -201,6 +211,7 @@ def run_sequence(
     *,
     strict: bool = False,
     form: Frame | None = None,
+    cover: Callable[[VoxelMap, int], VoxelMap] = lambda voxel_map, index: voxel_map,
 ) -> Iterator[tuple[VoxelMap, FusedFrame]]:
     """Fuses prepared frames one after the other.
 
@@ -213,6 +224,7 @@ def run_sequence(
         strict: stop at a frame that cannot be used.
         form: that of the frames (`frame_form`): the step is compiled for it while the first ones are read. Without it,
             the first frame that is ready compiles the step.
+        cover: of a map that is a part of a larger one: moves it so that it holds the view of a frame, given its index.
 
     Yields:
         After each frame, the map so far and what became of the frame. The map is donated to the
@@ -235,6 +247,7 @@ def run_sequence(
             mapper, cost = compile_step(mapper, voxel_map, prepared.frame, params, key)
             news = cost
         with timed_stage("step", prepared.stages_s):
+            voxel_map = cover(voxel_map, prepared.index)
             voxel_map, info = mapper.step(voxel_map, prepared.frame, params, key)
             jax.block_until_ready(voxel_map.log_odds)
         yield voxel_map, FusedFrame(prepared, info, news)

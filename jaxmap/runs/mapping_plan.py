@@ -19,16 +19,18 @@ from jaxmap.errors import UsageError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, site_lattice, usable_depth
+from jaxmap.geometry.grid import window_shape
 from jaxmap.geometry.options import GridOptions, Triple
 from jaxmap.mapping.observations import Observations
 from jaxmap.mapping.sequence import PreparedFrame, frame_form, observed_frames, prepare_frames
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
+from jaxmap.mapping.tiles import block_shape, whole_tiles
 from jaxmap.runs.config import MapConfig, PerceiveConfig
 from jaxmap.runs.labelling import Notify, as_usage_error
 from jaxmap.runs.perceiving import Keeper, make_keeper
 from jaxmap.runs.perception import Perception, plan_perception, saw_relief
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.types import Frame, GridSpec, StereoCamera, make_grid
+from jaxmap.types import MAX_TENSOR_ELEMENTS, Frame, GridSpec, StereoCamera, make_grid
 
 DEFAULT_VOXEL_M: Triple = (0.05, 0.05, 0.2)
 """The voxels of a map whose settings name none."""
@@ -80,13 +82,22 @@ def _extent(grid: GridSpec) -> tuple[np.ndarray, np.ndarray]:
     return lower, lower + np.asarray(grid.voxel_size_m, np.float64) * grid.shape
 
 
-def describe_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
+def describe_grid(
+    grid: GridSpec,
+    depth_range_m: tuple[float, float],
+    class_count: int,
+    members: int,
+    block: tuple[int, int, int] | None = None,
+) -> str:
     """One line on what is mapped, and the memory it takes."""
+    taken = f"{map_bytes(grid if block is None else replace(grid, shape=block), class_count, members) / 2**20:.0f} MiB"
+    if block is not None:
+        taken = f"in tiles on disk, {' x '.join(map(str, block))} voxels around the rover in memory, {taken}"
     size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
     return (
         f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
         f"{size} m, {1 + class_count} channels{f' and {members} members of 2' if members else ''}: "
-        f"{map_bytes(grid, class_count, members) / 2**20:.0f} MiB"
+        f"{taken}"
     )
 
 
@@ -97,6 +108,8 @@ class Plan(Perception):
     Attributes:
         keeper: keeps what is perceived on the way, where that was asked for.
         pose_errors: of the members of an ensemble, for each frame.
+        block_shape: of a map that is larger than the memory it may take: voxels along each axis of the part that is in
+            memory.
     """
 
     grid: GridSpec
@@ -108,6 +121,7 @@ class Plan(Perception):
     key: PRNGKeyArray
     keeper: Keeper | None = None
     pose_errors: Float[np.ndarray, "N M 6"] | None = None
+    block_shape: tuple[int, int, int] | None = None
 
     @property
     def members(self) -> int:
@@ -129,7 +143,8 @@ class Plan(Perception):
             keep_in: the observations to be written on the way, with a keeper.
         """
         if self.observations is not None:
-            return observed_frames(self.observations, pose_errors=self.pose_errors, first=first)
+            more: Any = {"left_image": self.left_image, "pose_errors": self.pose_errors}
+            return observed_frames(self.observations, first=first, **more)
         if self.keeper is not None and keep_in is not None:
             return self.keeper.frames(keep_in, range(first, len(self.sequence.frames)), self.pose_errors)
         return prepare_frames(
@@ -163,6 +178,8 @@ def plan_run(
     on_frame: OnFrame = lambda done, total: None,
     *,
     keep: bool = False,
+    images: bool = False,
+    in_tiles: bool = False,
 ) -> Plan:
     """Opens the sequence or its observations, and decides range, bounds, labeller and step.
 
@@ -172,11 +189,13 @@ def plan_run(
         notify: takes lines for the user.
         on_frame: is told of the progress of odometry, where it gives the poses.
         keep: keep what is perceived, as observations.
+        images: of observations, too, let the labeller see the images (`plan_perception`).
+        in_tiles: a map that takes more memory than it may is kept in tiles, not refused.
 
     Raises:
         JaxmapError: the data or the settings do not serve.
     """
-    seen = plan_perception(source, config, notify, on_frame)
+    seen = plan_perception(source, config, notify, on_frame, images=images)
     keeper = None
     if keep:
         keeper = make_keeper(seen, config, config.fusion.disparity_sigma_px)
@@ -190,8 +209,18 @@ def plan_run(
         rule = config.fusion.rule(labeller.classes)
         fusion_params = make_fusion_params(labeller.classes, config.fusion)
         members = _members(config, rule, labeller.classes)
-    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members))
-    check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
+    # The members of an ensemble stand elsewhere.
+    T_known = None if members else sequence.T_world_camera @ front_end.T_raw_rectified
+    block = None
+    limit_bytes = min(config.grid.max_memory_gib * 2**30, 4 * MAX_TENSOR_ELEMENTS)
+    if in_tiles and not members and map_bytes(grid, len(labeller.classes)) > limit_bytes:
+        shape = window_shape(grid, camera, depth_range_m[1], T_known)
+        block = block_shape(whole_tiles(grid), shape, 1 + len(labeller.classes), limit_bytes)
+    if block is None:
+        check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
+    else:
+        grid = whole_tiles(grid)
+    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block))
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
     if members:
@@ -208,16 +237,16 @@ def plan_run(
         fusion=fusion_attribute(config.fusion, rule) | ({"ensemble": asdict(config.ensemble)} if members else {}),
         mapper=make_mapper(
             camera,
-            grid,
+            grid if block is None else replace(grid, shape=block),
             labeller,
             rule,
             depth_range_m,
             members=members,
-            # The members of an ensemble stand elsewhere.
-            T_world_camera=None if members else sequence.T_world_camera @ front_end.T_raw_rectified,
+            T_world_camera=T_known,
         ),
         key=key,
         pose_errors=pose_errors,
+        block_shape=block,
     )
 
 

@@ -22,7 +22,6 @@ from jaxmap.host.replacement import Replacement
 from jaxmap.host.stages import timed_stage
 from jaxmap.labellers.base import Labeller
 from jaxmap.mapping.observations import (
-    Kept,
     Observation,
     ObservationAttributes,
     Observations,
@@ -34,6 +33,7 @@ from jaxmap.mapping.observations import (
     write_attributes,
     write_observation,
 )
+from jaxmap.mapping.quantised import Kept
 from jaxmap.mapping.sequence import PreparedFrame, as_prepared, frame_form, prepare_frames
 from jaxmap.mapping.step import perceive_frame
 from jaxmap.runs.checking import findings_tree

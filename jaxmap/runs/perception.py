@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from jaxmap.checks.check import open_front_end
 from jaxmap.checks.finding import Finding
-from jaxmap.datasets import StereoSequence, open_sequence
-from jaxmap.datasets.base import OnFrame, from_images, read_pose_track, timed_track
+from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
+from jaxmap.datasets.base import FrameRef, OnFrame, from_images, read_pose_track, timed_track
 from jaxmap.datasets.label_files import LabelFolder
 from jaxmap.datasets.pose_axes import to_z_up
 from jaxmap.datasets.poses import poses_at
@@ -21,12 +21,12 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.geometry.options import GroundOptions
 from jaxmap.host.files import real_path
 from jaxmap.host.output_folder import dotted
-from jaxmap.labellers.base import Labeller
-from jaxmap.mapping.observations import ObservationAttributes, Observations, open_observations
+from jaxmap.labellers.base import Labeller, make_no_labeller
+from jaxmap.mapping.observations import ObservationAttributes, Observations, open_observations, read_attributes
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.runs.checking import warn_of_faults
-from jaxmap.runs.config import CHOSEN_ANEW, PerceiveConfig, config_tree, observations_in
+from jaxmap.runs.config import CHOSEN_ANEW, CheckConfig, PerceiveConfig, check_perception, config_tree, observations_in
 from jaxmap.runs.labelling import (
     ModelFile,
     Notify,
@@ -35,9 +35,12 @@ from jaxmap.runs.labelling import (
     choose_labeller,
     choose_model,
     describe_network,
+    network_size_px,
 )
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.types import StereoCamera
+from jaxmap.types import StereoCamera, pinhole
+
+MapSettings = TypeVar("MapSettings", bound=PerceiveConfig)
 
 _KEY_FRAMES = 4
 
@@ -59,6 +62,7 @@ class Perception:
         network: that itself, where it runs here.
         findings: of the quick check of the sequence.
         observations: what was perceived before, where that is what is read.
+        left_image: reads the rectified left image of a frame that was observed, where the labeller sees it anew.
     """
 
     source: str
@@ -70,6 +74,7 @@ class Perception:
     network: SavedModel | None = None
     findings: tuple[Finding, ...] = ()
     observations: Observations | None = None
+    left_image: Callable[[FrameRef], np.ndarray] | None = None
 
     @property
     def key_frames(self) -> set[int]:
@@ -92,7 +97,12 @@ class Perception:
 
 
 def plan_perception(
-    source: str, config: PerceiveConfig, notify: Notify, on_frame: OnFrame = lambda done, total: None
+    source: str,
+    config: PerceiveConfig,
+    notify: Notify,
+    on_frame: OnFrame = lambda done, total: None,
+    *,
+    images: bool = False,
 ) -> Perception:
     """Opens a sequence, or observations, and decides what labels the points.
 
@@ -101,12 +111,14 @@ def plan_perception(
         config: the settings.
         notify: takes lines for the user.
         on_frame: is told of the progress of odometry, where it gives the poses.
+        images: of observations only disparities and poses are taken; a network sees the images of their sequence.
 
     Raises:
         JaxmapError: the data or the settings do not serve.
     """
     if (folder := observations_in(source)) is not None:
-        return _of_observations(folder, config, notify)
+        seen = _of_observations(folder, config, notify, images=images)
+        return _with_images(seen, config, notify) if images else seen
     sequence = open_sequence(source, config, on_frame)
     if config.strict and sequence.pose_faults:
         raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
@@ -136,11 +148,11 @@ def plan_perception(
     )
 
 
-def _of_observations(folder: Path, config: PerceiveConfig, notify: Notify) -> Perception:
-    """What observations hold, for these settings."""
+def _of_observations(folder: Path, config: PerceiveConfig, notify: Notify, *, images: bool) -> Perception:
+    """What observations hold, for these settings; for images, which are labelled anew, their geometry alone."""
     observations = open_observations(folder)
     attributes = observations.attributes
-    check_perceived_so(config, attributes, folder)
+    check_perceived_so(config, observations, geometry_alone=images)
     frames = len(observations.frames)
     if not attributes.complete:
         left = f"{frames} of {attributes.frames} frames are there"
@@ -164,14 +176,14 @@ def _of_observations(folder: Path, config: PerceiveConfig, notify: Notify) -> Pe
     front_end.T_raw_rectified = np.array(attributes.T_raw_rectified)
     if attributes.alignment_rad is not None:
         front_end.alignment_rad = np.array(attributes.alignment_rad)
-    of_kept = config.labeller == attributes.labeller
+    of_kept = config.labeller == attributes.labeller and not images
     soft = attributes.kept == "class_probabilities" if config.labeller == "files" else None
     network, model = None, None
     if of_kept and attributes.network is not None:
         network = _architecture_of(attributes.network, folder)
         model = ModelFile(Path(attributes.model["file"]), attributes.model["sha256"]) if attributes.model else None
     with as_usage_error():
-        labeller = choose_labeller(config, soft, network, observations.camera)
+        labeller = make_no_labeller() if images else choose_labeller(config, soft, network, observations.camera)
     if model is not None and network is not None:
         notify(describe_network(model, network, labeller.classes))
     findings = tuple(Finding(**finding) for finding in attributes.findings)
@@ -221,16 +233,68 @@ def _with_poses(observations: Observations, config: PerceiveConfig, notify: Noti
     return replace(kept, T_world_camera=T_world_camera)
 
 
-def check_perceived_so(config: PerceiveConfig, attributes: ObservationAttributes, where: Path) -> None:
+def _with_images(seen: Perception, config: PerceiveConfig, notify: Notify) -> Perception:
+    """The same frames, seen anew by a network: with the images of the sequence that they were perceived from.
+
+    Raises:
+        JaxmapError: that sequence is not there any more, or has another camera or other frames.
+    """
+    observations = seen.observations
+    assert observations is not None
+    attributes, where = observations.attributes, observations.folder
+    fix = "bring the sequence back as it was, or perceive it again"
+    perceived = check_perception(attributes.settings, where)
+    sequence = open_sequence(attributes.sequence, perceived)
+    front_end = open_front_end(sequence, perceived.stereo, lambda line: None)
+    if pinhole(front_end.camera) != pinhole(seen.front_end.camera):
+        raise JaxmapError(f"the camera of {attributes.sequence} is another by now", where=where, fix=fix)
+    refs = {ref.name: ref for ref in sequence.frames}
+    if lost := [ref.name for ref in observations.frames if ref.name not in refs]:
+        raise JaxmapError(f"{attributes.sequence} has no frame {lost[0]} any more", where=where, fix=fix)
+
+    def left_image(ref: FrameRef) -> np.ndarray:
+        pair = sequence.read_pair(refs[ref.name])
+        return front_end.rectify(pair.left, pair.right)[0]
+
+    model, network = choose_model(config)
+    with as_usage_error():
+        labeller = choose_labeller(config, None, network, seen.front_end.camera)
+    if model is not None and network is not None:
+        notify(describe_network(model, network.architecture, labeller.classes))
+    return replace(seen, labeller=labeller, model=model, network=network, left_image=left_image)
+
+
+def settings_taken_over(config: MapSettings, observations: Path) -> MapSettings:
+    """The settings with those of reading and matching that the frames were perceived with, where they name none."""
+    usual, then = type(config)(), check_perception(read_attributes(observations).settings, observations)
+    names = {one.name for one in fields(CheckConfig)} - {*CHOSEN_ANEW}
+    taken = {name: getattr(then, name) for name in names if getattr(config, name) == getattr(usual, name)}
+    return replace(config, **taken)
+
+
+def check_perceived_so(config: PerceiveConfig, observations: Observations, *, geometry_alone: bool = False) -> None:
     """Refuses settings under which the frames would have been perceived otherwise.
+
+    Args:
+        config: the settings of what fuses them.
+        observations: the frames.
+        geometry_alone: only of their disparities; what labels them is of no account.
 
     Raises:
         UsageError: there are some; they are named.
     """
+    attributes, where = observations.attributes, observations.folder
     now, then = dotted(config_tree(PerceiveConfig.of(config))), dotted(attributes.settings)
-    if config.labeller not in (attributes.labeller, "plane", "relief", "none"):
+    size_px = network_size_px(config, observations.camera)
+    now["deeplab.size_px"] = None if size_px is None else list(size_px)
+    if geometry_alone:
+        of_geometry = {one.name for one in fields(ReadOptions)}
+        now = {name: value for name, value in now.items() if name.partition(".")[0] in {*of_geometry, "stereo"}}
+    elif config.labeller not in (attributes.labeller, "plane", "relief", "none"):
         kept = f"the observations hold no labels of {config.labeller}: they were perceived with {attributes.labeller}"
         raise UsageError(kept, where=where, fix="perceive the sequence again with that labeller")
+    # Without a checksum any model will do: it is not run again.
+    now["model_sha256"] = now.get("model_sha256") or then.get("model_sha256")
     differing = [name for name in now if now[name] != then.get(name) and not _is_free(name, attributes)]
     if differing:
         raise UsageError(
@@ -248,6 +312,8 @@ def _is_free(name: str, attributes: ObservationAttributes) -> bool:
     free = (*CHOSEN_ANEW, "labeller", "deeplab.soft", "deeplab.temperature")
     if attributes.kept in (None, "logits"):
         free = (*free, "classes")
+    if attributes.kept != "logits":
+        free = (*free, "model", "model_sha256", "deeplab.size_px", "deeplab.see_relief")
     return name in free or name.startswith(("plane.", "deeplab.class_map"))
 
 

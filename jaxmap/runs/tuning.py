@@ -20,7 +20,8 @@ from jaxmap.report.tuning_page import tuning_page
 from jaxmap.runs.checking import finding_line
 from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
-from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
+from jaxmap.runs.labelling import Notify
+from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
 from jaxmap.tuning.descent import Step, descend
 from jaxmap.tuning.evidence_cache import CacheRecipe, build_cache, tunable_numbers

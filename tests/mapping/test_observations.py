@@ -23,14 +23,11 @@ from jaxmap.mapping.observations import (
     ObservationAttributes,
     is_observed,
     open_observations,
-    quantise_disparity,
-    quantise_kept,
     remove_stray_frames,
-    restore_disparity,
-    restore_kept,
     write_attributes,
     write_observation,
 )
+from jaxmap.mapping.quantised import quantise_disparity, quantise_kept, restore_disparity, restore_kept
 
 SIZE = (6, 8)
 CAMERA = dict(fx_px=8.0, fy_px=8.0, cx_px=4.0, cy_px=3.0, baseline_m=0.1, doffs_px=0.0, width_px=8.0, height_px=6.0)
