@@ -211,15 +211,9 @@ def plan_run(
         members = _members(config, rule, labeller.classes)
     # The members of an ensemble stand elsewhere.
     T_known = None if members else sequence.T_world_camera @ front_end.T_raw_rectified
-    block = None
-    limit_bytes = min(config.grid.max_memory_gib * 2**30, 4 * MAX_TENSOR_ELEMENTS)
-    if in_tiles and not members and map_bytes(grid, len(labeller.classes)) > limit_bytes:
-        shape = window_shape(grid, camera, depth_range_m[1], T_known)
-        block = block_shape(whole_tiles(grid), shape, 1 + len(labeller.classes), limit_bytes)
-    if block is None:
-        check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
-    else:
-        grid = whole_tiles(grid)
+    window = window_shape(grid, camera, depth_range_m[1], T_known)
+    tiled = in_tiles and not members
+    grid, block = _fit_memory(grid, window, len(labeller.classes), members, config.grid.max_memory_gib, tiled=tiled)
     notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block))
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
@@ -248,6 +242,23 @@ def plan_run(
         pose_errors=pose_errors,
         block_shape=block,
     )
+
+
+def _fit_memory(
+    grid: GridSpec, window: tuple[int, int, int], class_count: int, members: int, limit_gib: float, *, tiled: bool
+) -> tuple[GridSpec, tuple[int, int, int] | None]:
+    """The grid and, where it is kept in tiles, voxels along each axis of the block that is in memory.
+
+    Raises:
+        JaxmapError: it takes more memory than it may, or would even in tiles.
+    """
+    limit_bytes = min(limit_gib * 2**30, 4 * MAX_TENSOR_ELEMENTS)
+    if tiled and map_bytes(grid, class_count) > limit_bytes:
+        block = block_shape(whole_tiles(grid), window, 1 + class_count, limit_bytes)
+        if block is not None:
+            return whole_tiles(grid), block
+    check_memory(grid, class_count, limit_gib, members)
+    return grid, None
 
 
 def _note_other_noise(observations: Observations, config: MapConfig, notify: Notify) -> None:
