@@ -16,7 +16,7 @@ from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, as
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from jaxmap.errors import JaxmapError
 
@@ -100,7 +100,7 @@ def _run(
             if rounds_in_vain >= _ROUNDS:
                 raise JaxmapError(
                     f"workers are lost again and again ({reason[:200]})",
-                    fix="take fewer workers, or let each have less memory (--grid.max-memory-gib); what is done is kept",
+                    fix="take fewer workers, or let each take less (--grid.max-memory-gib); what is done is kept",
                 )
             notify(f"workers were lost; {len(left)} of {len(tasks)} tasks run again")
 

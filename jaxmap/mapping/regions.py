@@ -17,11 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from jaxmap.errors import JaxmapError
+from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import sync, write_error
 from jaxmap.mapping.arrays import (
@@ -36,10 +35,11 @@ from jaxmap.mapping.arrays import (
     stored_chunks,
 )
 from jaxmap.mapping.attributes import MapAttributes, to_json
+from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import Mapper, MapperParams, StepReport
 from jaxmap.mapping.store import swap_in, sync_tree
 from jaxmap.mapping.tiles import Tile, block_shape, tiles_of
-from jaxmap.types import Frame, GridSpec, VoxelMap, to_device
+from jaxmap.types import GridSpec, VoxelMap, make_voxel_map, to_device
 
 RECORD = f"{LOG_ODDS}/tiles.json"
 """Within a map that was fused in regions: what each of its tiles is made of."""
@@ -170,54 +170,43 @@ def region_shape(
     return best
 
 
-class FusedRegion(NamedTuple):
-    """A region as it comes out.
-
-    Attributes:
-        voxel_map: dense, from `Region.first` on.
-        reports: of the frames, by index.
-        faults: the frames that could not be read; then the rest means nothing.
-    """
-
-    voxel_map: VoxelMap
-    reports: dict[int, StepReport]
-    faults: dict[int, JaxmapError]
-
-
 def fuse_region(
     mapper: Mapper,
+    classes: tuple[str, ...],
     grid: GridSpec,
-    frames: Iterable[tuple[int, int, Frame | JaxmapError]],
+    frames: Iterable[PreparedFrame],
+    numbers: Mapping[int, int],
     params: MapperParams,
     key: PRNGKeyArray,
-    on_frame: Callable[[], None] = lambda: None,
-) -> FusedRegion:
+    on_frame: Callable[[PreparedFrame, StepReport], None] = lambda prepared, report: None,
+) -> tuple[VoxelMap, dict[int, JaxmapError]]:
     """Fuses frames into a dense map of a region.
 
     Args:
         mapper: of `make_mapper` for a grid of this shape.
+        classes: of the map.
         grid: of the region.
-        frames: index, how many frames of the run were fused before it, and the frame, or why there is none.
+        frames: in the order of the run.
+        numbers: of each frame, by its index, how many of the run are fused before it.
         params: the numbers of the step.
         key: that of the run.
         on_frame: is called after each.
+
+    Returns:
+        The map, and the frames that could not be read, by index: where there are any, the map is not whole.
     """
-    classes = mapper.init().classes
-    voxel_map = VoxelMap(
-        jnp.zeros((1 + len(classes), *grid.shape), jnp.float32), to_device(0, np.int32), grid, classes
-    )
-    reports: dict[int, StepReport] = {}
+    voxel_map = make_voxel_map(grid, classes)
     faults: dict[int, JaxmapError] = {}
-    for index, number, frame in frames:
-        if isinstance(frame, JaxmapError):
-            faults[index] = frame
+    for prepared in frames:
+        if prepared.frame is None:
+            faults[prepared.index] = prepared.fault or FrameError("it cannot be read")
         elif not faults:
             # The step folds the number of fused frames into its key.
-            voxel_map = replace(voxel_map, frames_fused=to_device(number, np.int32))
-            voxel_map, reports[index] = mapper.step(voxel_map, frame, params, key)
+            voxel_map = replace(voxel_map, frames_fused=to_device(numbers[prepared.index], np.int32))
+            voxel_map, report = mapper.step(voxel_map, prepared.frame, params, key)
+            on_frame(prepared, report)
             voxel_map.log_odds.block_until_ready()
-        on_frame()
-    return FusedRegion(voxel_map, reports, faults)
+    return voxel_map, faults
 
 
 def part_name(digest: str, sources: Mapping[Tile, str]) -> str:

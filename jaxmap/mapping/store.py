@@ -230,6 +230,7 @@ def _write_group(folder: Path, arrays: dict[str, StoredArray], stored: dict[str,
 
 
 def swap_in(temporary: Path, target: Path) -> None:
+    """Puts a map in the place of another, which is there, whole, until then."""
     aside = _set_aside(target)
     replaces = target.exists()
     if replaces:
@@ -255,6 +256,7 @@ def _replaceable(target: Path) -> bool:
 
 
 def sync_tree(folder: Path) -> None:
+    """Waits until all that is in a folder has reached the disk."""
     for parent, _, names in os.walk(folder):
         for name in names:
             sync(Path(parent, name))

@@ -76,7 +76,7 @@ def run_plan(
     saved_s = resumed_s = time.perf_counter()
     if plan.keeper is not None:
         plan.keeper.begin(folder.observations)
-    frames = plan.prepare(log.next_index, keep_in=folder.observations)
+    frames = plan.prepare(range(log.next_index, len(plan.sequence.frames)), keep_in=folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
     run = run_sequence(
         plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form, cover=memory.cover
@@ -110,16 +110,16 @@ def run_plan(
     finally:
         step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
-    _write_key_frames(plan, folder, key_frames)
+    write_key_frames(plan, folder, key_frames)
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    reader = memory.save(voxel_map, _attributes(plan, log, voxel_map))
-    metrics = _write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
+    reader = memory.save(voxel_map, map_attributes(plan, log, voxel_map))
+    metrics = write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
-    for note in _notes(plan, log, metrics):
+    for note in notes(plan, log, metrics):
         notify(f"note: {note}")
     return metrics
 
@@ -189,8 +189,8 @@ def _save(
     key_frames: list[tuple[PreparedFrame, int]],
 ) -> None:
     """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
-    _write_key_frames(plan, folder, key_frames)
-    memory.save(voxel_map, _attributes(plan, log, voxel_map))
+    write_key_frames(plan, folder, key_frames)
+    memory.save(voxel_map, map_attributes(plan, log, voxel_map))
 
 
 def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
@@ -215,7 +215,7 @@ def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
     return score_disparity(rectified.disparity_px, truth_px)
 
 
-def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
+def notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
     said = {finding.kind for finding in plan.findings}
     if log.too_near and not said & {"near-limit", "vertical-disparity"}:
@@ -243,7 +243,7 @@ def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"no voxel is occupied: {reason}"
 
 
-def _write_outputs(
+def write_outputs(
     plan: Plan, folder: RunFolder, log: RunLog, reader: MapReader, details: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes all that a run leaves beside its map, and returns its metrics, the details among them."""
@@ -298,7 +298,8 @@ def _check_same(plan: Plan, voxel_map: VoxelMap, log: RunLog, where: Path) -> No
         )
 
 
-def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
+def map_attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap | None = None) -> MapAttributes:
+    """What is stored beside the map, which is looked at where it has an ensemble."""
     log.digest = plan.digest(log.next_index)
     return MapAttributes(
         crs=plan.sequence.crs,
@@ -306,11 +307,11 @@ def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
         T_world_source=plan.sequence.T_world_source,
         fusion=plan.fusion,
         progress=log.as_json(),
-        layers=named_layers(voxel_map, plan.params.fusion, plan.rule),
+        layers={} if voxel_map is None else named_layers(voxel_map, plan.params.fusion, plan.rule),
     )
 
 
-def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[PreparedFrame, int]]) -> None:
+def write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[PreparedFrame, int]]) -> None:
     """Writes pictures of frames, with the labels that the step gave each as the so manieth, and empties the list."""
     for prepared, number in key_frames:
         assert prepared.frame is not None and prepared.rectified is not None

@@ -92,7 +92,9 @@ def test_workers_end_with_the_process_that_gave_the_tasks(tmp_path):
         )
     )
     names = [tmp_path / "one", tmp_path / "two"]
-    parent = subprocess.Popen([sys.executable, script, *names], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    parent = subprocess.Popen(
+        [sys.executable, script, *names], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    )
     wait_until(lambda: all(name.exists() and name.read_text() for name in names))
     parent.kill()
     parent.wait()

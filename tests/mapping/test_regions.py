@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxmap.datasets.base import FrameRef
 from jaxmap.errors import FrameError
 from jaxmap.fusion.options import FusionOptions
 from jaxmap.fusion.params import make_fusion_params
@@ -34,6 +35,7 @@ from jaxmap.mapping.regions import (
     tile_sources,
     write_part,
 )
+from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.mapping.store import load_map
 from jaxmap.mapping.tiles import TILE, whole_tiles
@@ -78,6 +80,10 @@ def frame(disparity_px: np.ndarray, pose: np.ndarray) -> Frame:
     return Frame(to_device(disparity_px), jaxlie.SE3.from_matrix(to_device(pose, np.float32)))
 
 
+def prepared(index: int, seen: Frame | None) -> PreparedFrame:
+    return PreparedFrame(index, FrameRef(f"f{index}", float(index), Path("left"), Path("right")), seen)
+
+
 def mapper_of(grid: GridSpec, poses: np.ndarray):
     return make_mapper(CAMERA, grid, LABELLER, RULE, (0.3, FARTHEST_M), T_world_camera=poses)
 
@@ -110,11 +116,14 @@ class InRegions:
         regions = regions_of(self.grid, shape, left)
         for number, region in enumerate(regions):
             here = replace(self.grid, first=to_device(np.array(region.first), np.int32), shape=shape)
-            frames = ((i, i, frame(self.seen[i], self.poses[i])) for i in region.frames)
-            fused = fuse_region(mapper, here, frames, PARAMS, KEY)
-            assert not fused.faults
-            assert fused.reports.keys() == set(region.frames)
-            write_part(parts / f"{number}", fused.voxel_map, region.tiles, {})
+            frames = (prepared(i, frame(self.seen[i], self.poses[i])) for i in region.frames)
+            numbers, told = {i: i for i in region.frames}, []
+            fused, faults = fuse_region(
+                mapper, ROVER_CLASSES, here, frames, numbers, PARAMS, KEY, lambda one, report: told.append(one.index)
+            )
+            assert not faults
+            assert tuple(told) == region.frames
+            write_part(parts / f"{number}", fused, region.tiles, {})
             files |= part_tiles(parts / f"{number}")
         record = TileRecord("run", self.sources, set(), {})
         assemble_map(path, self.grid, ROVER_CLASSES, len(self.names), DONE, files, record)
@@ -159,9 +168,7 @@ def test_corrected_poses_give_the_bits_of_mapping_anew(tmp_path_factory, seed, m
     shape = shape_of(again, (2, 2, 1))
     fused = again.map(folder / "new.zarr", shape, folder / "new", old=folder / "old.zarr")
     again.map(folder / "anew.zarr", shape, folder / "anew")
-    np.testing.assert_array_equal(
-        load_map(folder / "new.zarr")[0].log_odds, load_map(folder / "anew.zarr")[0].log_odds
-    )
+    np.testing.assert_array_equal(load_map(folder / "new.zarr")[0].log_odds, load_map(folder / "anew.zarr")[0].log_odds)
     if not moved:
         assert not fused
     elif len(moved) == 1 and size_m < 0.1 and again.grid.shape == run.grid.shape:
@@ -220,6 +227,7 @@ def test_a_frame_that_cannot_be_read_is_told_and_nothing_else(tmp_path):
     run = scene(4, 2)
     mapper = mapper_of(run.grid, run.poses)
     fault = FrameError("it is damaged")
-    fused = fuse_region(mapper, run.grid, [(0, 0, fault), (1, 1, frame(run.seen[1], run.poses[1]))], PARAMS, KEY)
-    assert fused.faults == {0: fault}
-    assert not fused.reports
+    frames = [replace(prepared(0, None), fault=fault), prepared(1, frame(run.seen[1], run.poses[1]))]
+    fused, faults = fuse_region(mapper, ROVER_CLASSES, run.grid, frames, {0: 0, 1: 1}, PARAMS, KEY)
+    assert faults == {0: fault}
+    assert not fused.log_odds.any()
