@@ -44,6 +44,11 @@ class Workers:
     scheduler: str | None = None
     patience_s: float = 600.0
 
+    @property
+    def shared(self) -> bool:
+        """Whether tasks run anywhere but in this process."""
+        return self.scheduler is not None or self.processes > 1
+
 
 def run_tasks(
     workers: Workers,
@@ -171,7 +176,7 @@ def _dask_losses() -> tuple[type[BaseException], ...]:
     """What the tasks of a cluster end with that has lost their workers, or its scheduler."""
     try:
         from distributed import CancelledError as Cancelled
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
     except ImportError as fault:
         raise JaxmapError(

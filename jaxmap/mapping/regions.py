@@ -419,7 +419,7 @@ def kept_tiles(path: Path, record: TileRecord, sources: Mapping[Tile, str], grid
     return KeptTiles(files, done, lost)
 
 
-def tile_part(tile: Tile) -> tuple[slice, ...]:
+def tile_part(tile: Sequence[int]) -> tuple[slice, ...]:
     """Where a tile lies in an array of log-odds that begins with tile 0 0 0."""
     return (slice(None), *(slice(i * edge, (i + 1) * edge) for i, edge in zip(tile, TILE, strict=True)))
 

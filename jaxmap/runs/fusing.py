@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -48,12 +49,14 @@ from jaxmap.mapping.step import StepReport
 from jaxmap.mapping.store import open_map
 from jaxmap.mapping.tiles import Tile
 from jaxmap.report.run_page import write_report
-from jaxmap.runs.config import CHOSEN_ANEW, MapConfig, check_config, config_tree
+from jaxmap.runs.config import CHOSEN_ANEW, MapConfig, absolute_tree, check_config
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import FrameNumbers, RunLog, numbers_of
 from jaxmap.runs.mapping import map_attributes, notes, write_key_frames, write_outputs
 from jaxmap.runs.mapping_plan import Plan, Sharing, plan_run
+from jaxmap.runs.perceiving import run_perception
+from jaxmap.runs.perceiving_shared import check_shareable, keep_on_workers
 from jaxmap.types import to_device
 
 ON_A_CLUSTER = 16
@@ -135,6 +138,99 @@ def fuse_task(task: FuseTask) -> dict[int, str]:
         if not faults:
             write_part(Path(task.place), voxel_map, task.tiles, {"frames": told})
         return {index: str(fault) for index, fault in faults.items()}
+
+
+def map_observations(
+    source: str,
+    config: MapConfig,
+    folder: RunFolder,
+    workers: Workers,
+    notify: Notify,
+    steps: Steps,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    update: bool = False,
+) -> dict[str, Any]:
+    """Maps observations on workers: from their plan to the outputs.
+
+    Args:
+        source: the observations.
+        config: the settings.
+        folder: the run folder.
+        workers: where the tasks run.
+        notify: takes lines for the user.
+        steps: shows progress.
+        resume: go on with a run that was interrupted.
+        overwrite: replace the run that is there.
+        update: replace it, but for the tiles that are the same.
+
+    Returns:
+        The metrics, as they are in metrics.json.
+
+    Raises:
+        JaxmapError: as `plan_run`, `RunFolder.writing` and `run_shared`.
+    """
+    plan = plan_run(source, config, notify, shared=share(config, workers))
+    folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
+    with (
+        folder.locked(),
+        folder.writing(plan.settings(config), resume=resume, overwrite=overwrite, update=update) as work,
+    ):
+        old = folder.map if update else work.map if work.map.exists() else None
+        return run_shared(plan, config, work, workers=workers, old=old, notify=notify, steps=steps)
+
+
+def map_on_workers(
+    source: str,
+    config: MapConfig,
+    folder: RunFolder,
+    workers: Workers,
+    notify: Notify,
+    steps: Steps,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    keep: bool = False,
+) -> dict[str, Any]:
+    """Maps a sequence on workers: they perceive its frames, then they fuse what was perceived.
+
+    Args:
+        source: the sequence.
+        config: the settings.
+        folder: the run folder.
+        workers: where the tasks run.
+        notify: takes lines for the user.
+        steps: shows progress.
+        resume: go on with a run that was interrupted.
+        overwrite: replace the run that is there.
+        keep: keep the observations.
+
+    Returns:
+        The metrics, as they are in metrics.json.
+
+    Raises:
+        JaxmapError: as `map_observations`, and as `run_perception`.
+    """
+    check_shareable(config)
+    perceived = plan_run(source, config, lambda line: None, keep=True, in_tiles=True)
+    keeper = perceived.keeper
+    assert keeper is not None
+    folder.check_apart(perceived.source, perceived.images, (config.poses, config.calibration, config.model))
+    settings = perceived.settings(config) | {"keep_observations": keep}
+    with folder.locked(), folder.writing(settings, resume=resume, overwrite=overwrite) as work:
+        with steps("perceiving", "frames", len(perceived.sequence.frames)) as advance:
+            on_workers = partial(keep_on_workers, keeper, config, work, workers=workers, notify=notify)
+            run_perception(keeper, work, strict=config.strict, notify=notify, on_frame=advance, keep=on_workers)
+        # What chooses frames and poses has done so.
+        usual = MapConfig()
+        of_kept = replace(config, **{name: getattr(usual, name) for name in CHOSEN_ANEW if name != "strict"})
+        plan = plan_run(str(work.observations), of_kept, notify, shared=share(config, workers))
+        old = work.map if work.map.exists() else None
+        metrics = run_shared(plan, of_kept, work, workers=workers, old=old, notify=notify, steps=steps)
+        if not keep:
+            shutil.rmtree(work.observations, ignore_errors=True)
+        return metrics
 
 
 def run_shared(
@@ -330,11 +426,8 @@ def _digest(plan: Plan, config: MapConfig) -> str:
 
 def _told_to_workers(plan: Plan, config: MapConfig) -> str:
     """What a worker plans the run from, wherever it runs."""
-    tree = config_tree(config)
-    for name in _FILES:
-        if tree.get(name) is not None and Path(tree[name]).exists():
-            tree[name] = os.path.abspath(tree[name])
-    return json.dumps({"source": os.path.abspath(plan.source), "settings": tree, "shape": plan.block_shape})
+    settings = absolute_tree(config)
+    return json.dumps({"source": os.path.abspath(plan.source), "settings": settings, "shape": plan.block_shape})
 
 
 def _planned(run: str) -> Plan:
