@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from observed_scenes import CAMERA as scene_camera
+from observed_scenes import FARTHEST_M, HEIGHT_PX, VOXEL_M, WIDTH_PX, disparities, poses_along
 
 from jaxmap.datasets.base import FrameRef
 from jaxmap.errors import FrameError
@@ -41,35 +43,13 @@ from jaxmap.mapping.store import load_map
 from jaxmap.mapping.tiles import TILE, whole_tiles
 from jaxmap.types import Frame, GridSpec, make_stereo_camera, to_device
 
-CAMERA = make_stereo_camera(fx_px=30, cx_px=19.5, cy_px=14.5, baseline_m=0.3, width_px=40, height_px=30)
-FARTHEST_M, VOXEL_M = 6.0, 0.1
+CAMERA = make_stereo_camera(**scene_camera, width_px=WIDTH_PX, height_px=HEIGHT_PX)
 LABELLER = make_plane_labeller(ROVER_CLASSES, PlaneOptions())
 KEY = jax.random.key(3)
 OPTIONS = FusionOptions()
 RULE = OPTIONS.rule(ROVER_CLASSES)
 PARAMS = MapperParams(CAMERA, make_fusion_params(ROVER_CLASSES, OPTIONS), LABELLER.params)
 DONE = MapAttributes(progress={"complete": True})
-
-
-def poses_along(rng: np.random.Generator, count: int, step_m: float = 1.7) -> np.ndarray:
-    """Cameras on a winding path, a metre above the ground, that look down a little and to all sides."""
-    heading = np.cumsum(rng.normal(0, 0.4, count))
-    place = np.cumsum(step_m * np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1), axis=0)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    for pose, angle, at in zip(poses, heading + rng.normal(0, 0.3, count), place, strict=True):
-        forward = np.array([np.cos(angle) * 0.95, np.sin(angle) * 0.95, -0.31])
-        right = np.array([np.sin(angle), -np.cos(angle), 0.0])
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-        pose[:3, 3] = at + np.array([0.0, 0.0, 1.0])
-    return poses
-
-
-def disparities(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Ground with bumps, some of it unknown."""
-    row = np.arange(30)[None, :, None] - 4.0
-    disparity_px = np.maximum(row, 0.5) * 0.3 + rng.normal(0, 0.05, (count, 30, 40)) + 1.2
-    disparity_px[rng.random(disparity_px.shape) < 0.1] = np.nan
-    return disparity_px.astype(np.float32)
 
 
 def grid_of(poses: np.ndarray) -> GridSpec:
