@@ -155,18 +155,20 @@ def region_shape(
         None where not even the smallest region fits.
     """
     best, best_cost = None, math.inf
-    block = block_shape(grid, window_shape, channels, limit_bytes)
+    # A region need not hold a window wherever it lies: what is beyond its edge is fused in the next one.
+    x, y, z = (max(1, window - edge + 1) for window, edge in zip(window_shape, TILE, strict=True))
+    block = block_shape(grid, (x, y, z), channels, limit_bytes)
     while block is not None:
         # As many regions as with these, but of even size.
         counts = -(-np.array(grid.shape) // block)
         tiles = np.maximum(-(-np.array(grid.shape) // TILE // counts), -(-np.array(window_shape) // TILE))
-        x, y, z = (tiles * TILE).tolist()
-        costs = [len(region.frames) for region in regions_of(grid, (x, y, z), touching)]
+        a, b, c = (tiles * TILE).tolist()
+        costs = [len(region.frames) for region in regions_of(grid, (a, b, c), touching)]
         cost = max(sum(costs) / workers, max(costs, default=0))
         if cost < best_cost:
-            best, best_cost = (x, y, z), cost
+            best, best_cost = (a, b, c), cost
         smaller = 2.1 * 4 * channels * math.prod(block)
-        block = block_shape(grid, window_shape, channels, smaller) if workers > 1 else None
+        block = block_shape(grid, (x, y, z), channels, smaller) if workers > 1 else None
     return best
 
 

@@ -90,11 +90,12 @@ def describe_grid(
     class_count: int,
     members: int,
     block: tuple[int, int, int] | None = None,
+    held: str = "around the rover in memory",
 ) -> str:
     """One line on what is mapped, and the memory it takes."""
     taken = f"{map_bytes(grid if block is None else replace(grid, shape=block), class_count, members) / 2**20:.0f} MiB"
     if block is not None:
-        taken = f"in tiles on disk, {' x '.join(map(str, block))} voxels around the rover in memory, {taken}"
+        taken = f"in tiles on disk, {' x '.join(map(str, block))} voxels {held}, {taken}"
     size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
     return (
         f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
@@ -229,7 +230,8 @@ def plan_run(
         grid, block = _in_regions(grid, camera, labeller, depth_range_m[1], T_known, shared)
     else:
         grid, block = _fit_memory(grid, window, len(labeller.classes), members, config.grid.max_memory_gib, tiled=tiled)
-    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block))
+    held = ("fused at a time",) if shared else ()
+    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block, *held))
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
     if members:

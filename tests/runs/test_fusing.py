@@ -28,8 +28,10 @@ from jaxmap.runs.mapping import run_plan
 from jaxmap.runs.mapping_plan import plan_run
 
 FRAMES = 16
-SMALL_GIB = 0.03
+SMALL_GIB = 0.06
 """Memory of a map that then has several regions."""
+
+HERE = Workers()
 
 pytestmark = pytest.mark.slow
 
@@ -45,7 +47,7 @@ def config_of(out: Path, **changes: Any) -> MapConfig:
     return replace(config, grid=grid, depth=replace(config.depth, max_m=FARTHEST_M), **changes)
 
 
-def mapped(out: Path, run: Path, workers: Workers = Workers(), notes: list[str] | None = None, **words: Any) -> dict:
+def mapped(out: Path, run: Path, workers: Workers = HERE, notes: list[str] | None = None, **words: Any) -> dict:
     ways = {name: words.pop(name) for name in ("resume", "overwrite", "update") if name in words}
     told = [] if notes is None else notes
     return map_observations(str(out), config_of(out, **words), RunFolder(run), workers, told.append, no_steps, **ways)
