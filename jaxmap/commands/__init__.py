@@ -16,6 +16,7 @@ COMMANDS: dict[str, str] = {
     "weights": "convert or download pretrained networks",
     "export": "write a map in another file format",
     "report": "write the HTML report of a run again",
+    "view": "show a run in the viewer of rerun, frame by frame",
     "info": "print versions, devices and folders",
 }
 """Name and one-line help of each command, in the order of `jaxmap --help`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 OUTPUTS = (
     *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
-    *("config.yaml", "poses.tum", "pictures/"),
+    *("config.yaml", "poses.tum", "frames.csv", "pictures/"),
 )
 
 
@@ -28,9 +29,9 @@ OUTPUTS = (
 class MapArguments:
     """Map a stereo sequence, or what jaxmap perceive has kept of one, into a voxel map and its pictures.
 
-    Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
-    poses.tum, pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and
-    bev.tif: the probability of a missed rock.
+    Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml, poses.tum, frames.csv,
+    pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and bev.tif: the
+    probability of a missed rock.
     """
 
     sequence: tyro.conf.Positional[str]
@@ -59,6 +60,10 @@ class MapArguments:
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
     TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
+    view: bool = False
+    """Show the run in the viewer of rerun while it goes on (pip install 'jaxmap[view]')."""
+    view_save: Path | None = None
+    """Write what --view shows into this .rrd file, and open no window."""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
 
 
@@ -78,10 +83,15 @@ def main(words: Sequence[str]) -> int:
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.report.recording import check_viewer
     from jaxmap.runs.folder import RunFolder
-    from jaxmap.runs.mapping import run_plan
+    from jaxmap.runs.mapping import run_plan, unwatched
     from jaxmap.runs.mapping_plan import plan_run
+    from jaxmap.runs.viewing import live_view
 
+    watched = arguments.view or arguments.view_save is not None
+    if watched:
+        check_viewer(arguments.view_save)
     keep_compiled_programs(scopes=arguments.profile)
     # SIGTERM, which ends jobs of clusters and services, counts as Ctrl-C: the map is saved first.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -98,6 +108,7 @@ def main(words: Sequence[str]) -> int:
     with (
         folder.locked(),
         folder.writing(plan.settings(config), resume=resume, overwrite=overwrite) as work,
+        live_view(plan, arguments.view_save) if watched else nullcontext(unwatched) as watch,
         console.progress("mapping", len(plan.sequence.frames)) as advance,
     ):
         metrics = run_plan(
@@ -107,6 +118,7 @@ def main(words: Sequence[str]) -> int:
             checkpoint_every_s=arguments.checkpoint_every_s,
             notify=console.notify,
             on_frame=advance,
+            watch=watch,
             profile=arguments.profile,
         )
     return _tell(arguments, metrics, console)
@@ -143,6 +155,8 @@ def _tell(arguments: MapArguments, metrics: dict[str, Any], console: Console) ->
     missed, profile = ["missed.png"] if config.ensemble.members else [], ["profile/"] if arguments.profile else []
     kept = ["observations.zarr"] if keep else []
     console.result(arguments.out, (*OUTPUTS, *kept, *missed, *profile))
+    if arguments.view_save is not None:
+        console.result(arguments.view_save.parent, [arguments.view_save.name])
     return 0
 
 

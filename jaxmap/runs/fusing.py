@@ -14,7 +14,7 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -53,7 +53,7 @@ from jaxmap.runs.config import CHOSEN_ANEW, MapConfig, absolute_tree, check_conf
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import FrameNumbers, RunLog, numbers_of
-from jaxmap.runs.mapping import map_attributes, notes, write_key_frames, write_outputs
+from jaxmap.runs.mapping import Pictures, map_attributes, notes, write_outputs
 from jaxmap.runs.mapping_plan import Plan, Sharing, plan_run
 from jaxmap.runs.perceiving import run_perception
 from jaxmap.runs.perceiving_shared import check_shareable, keep_on_workers
@@ -408,10 +408,11 @@ def _fuse_left(work: _Work, workers: Workers, steps: Steps, notify: Notify) -> d
 
 def _write_pictures(plan: Plan, folder: RunFolder, numbers: dict[int, int]) -> None:
     """Writes the pictures of the key frames."""
-    chosen: Sequence[int] = sorted(plan.key_frames & numbers.keys())
-    for prepared in plan.prepare(chosen):
+    pictures = Pictures(plan, folder)
+    for prepared in plan.prepare(sorted(plan.key_frames.keys() & numbers.keys())):
         if prepared.frame is not None:
-            write_key_frames(plan, folder, [(prepared, numbers[prepared.index])])
+            pictures.waiting.append((prepared, numbers[prepared.index]))
+            pictures.write()
 
 
 def _digest(plan: Plan, config: MapConfig) -> str:

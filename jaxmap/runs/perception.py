@@ -42,7 +42,8 @@ from jaxmap.types import StereoCamera, pinhole
 
 MapSettings = TypeVar("MapSettings", bound=PerceiveConfig)
 
-_KEY_FRAMES = 4
+_KEY_FRAMES, _LARGE_EVERY = 22, 7
+"""Frames whose pictures are kept, evenly spaced, and which of them at full size: the first, the last, two between."""
 
 MOST_MOVED_M = 10_000.0
 """Other poses farther from those of the perception are of another place, or relative to another origin."""
@@ -77,12 +78,19 @@ class Perception:
     left_image: Callable[[FrameRef], np.ndarray] | None = None
 
     @property
-    def key_frames(self) -> set[int]:
-        """Indices of the frames whose pictures are kept; with observations, those that have one."""
+    def key_frames(self) -> dict[int, bool]:
+        """The frames whose pictures are kept, by their index, and whether at full size.
+
+        With observations, those that have a picture.
+        """
         count = len(self.sequence.frames)
-        if self.observations is not None:
-            return {index for index in range(count) if self.observations.picture(index) is not None}
-        return {int(index) for index in np.linspace(0, count - 1, _KEY_FRAMES)}
+        if self.observations is None:
+            spaced = np.linspace(0, count - 1, _KEY_FRAMES).round().astype(int).tolist()
+        else:
+            spaced = [index for index in range(count) if self.observations.picture(index) is not None]
+        # Of frames taken twice, in a short sequence, the large one counts.
+        small = dict.fromkeys(spaced, False)
+        return dict(sorted((small | dict.fromkeys(spaced[::_LARGE_EVERY], True)).items()))
 
     @property
     def images(self) -> Iterator[Path]:
