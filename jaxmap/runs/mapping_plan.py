@@ -131,9 +131,7 @@ class Plan(Perception):
     key: PRNGKeyArray
     keeper: Keeper | None = None
     pose_errors: Float[np.ndarray, "N M 6"] | None = None
-    """Of the members of an ensemble, for each frame."""
     block_shape: tuple[int, int, int] | None = None
-    """Of a map that is larger than the memory it may take: voxels along each axis of the part that is in memory."""
 
     @property
     def members(self) -> int:
