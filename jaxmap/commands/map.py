@@ -140,7 +140,7 @@ def _map_shared(arguments: MapArguments, folder: RunFolder, console: Console) ->
         raise UsageError(
             "--update brings a map of observations up to date",
             where=arguments.sequence,
-            fix="give the folder of jaxmap perceive or of --keep-observations",
+            fix="give the folder that jaxmap perceive has written",
         )
     ways = {"resume": arguments.resume, "overwrite": arguments.overwrite, "keep": arguments.keep_observations}
     return map_on_workers(arguments.sequence, config, folder, workers, *tell, **ways)

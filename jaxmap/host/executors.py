@@ -105,7 +105,7 @@ def _run(
             if rounds_in_vain >= _ROUNDS:
                 raise JaxmapError(
                     f"workers are lost again and again ({reason[:200]})",
-                    fix="take fewer workers, or let each take less (--grid.max-memory-gib); what is done is kept",
+                    fix="take fewer workers, or give each more memory; what is done is kept",
                 )
             notify(f"workers were lost; {len(left)} of {len(tasks)} tasks run again")
 

@@ -49,8 +49,9 @@ def config_of(out: Path, **changes: Any) -> MapConfig:
 
 def mapped(out: Path, run: Path, workers: Workers = HERE, notes: list[str] | None = None, **words: Any) -> dict:
     ways = {name: words.pop(name) for name in ("resume", "overwrite", "update") if name in words}
-    told = [] if notes is None else notes
-    return map_observations(str(out), config_of(out, **words), RunFolder(run), workers, told.append, no_steps, **ways)
+    told, config = [] if notes is None else notes, config_of(out, **words)
+    config = replace(config, grid=replace(config.grid, max_memory_gib=SMALL_GIB * workers.processes))
+    return map_observations(str(out), config, RunFolder(run), workers, told.append, no_steps, **ways)
 
 
 def log_odds(run: Path) -> np.ndarray:
