@@ -145,6 +145,8 @@ def _begin_worker() -> None:
 def _dask(workers: Workers, notify: Callable[[str], None]) -> Iterator[Executor]:
     client = _connect(workers, notify)
     try:
+        if not client.scheduler_info()["workers"]:
+            notify(f"the scheduler at {workers.scheduler} has no workers yet; waiting for some")
         yield client.get_executor(pure=False)
     finally:
         # A scheduler that is gone takes its time to be missed.

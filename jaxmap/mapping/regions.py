@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -233,12 +234,12 @@ def write_part(folder: Path, voxel_map: VoxelMap, tiles: Iterable[Tile], told: d
 
     if folder.exists():
         return
-    temporary = folder.with_name(f".{folder.name}.tmp-{os.getpid()}")
+    # Another machine may write the same, in a process of the same number.
+    temporary = folder.with_name(f".{folder.name}.tmp-{secrets.token_hex(8)}")
     low = np.asarray(voxel_map.grid.first) // TILE
     values = np.asarray(voxel_map.log_odds)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(temporary, ignore_errors=True)
         group = zarr.create_group(temporary, zarr_format=3)
         array = create_array(group, LOG_ODDS, values.shape, AXES)
         for tile in tiles:

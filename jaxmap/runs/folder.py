@@ -130,6 +130,9 @@ class RunFolder:
             )
         check_same_settings(self.config, dict(settings), CHOSEN_ANEW)
         work = RunFolder(self._replacement.new)
+        for path in work.path.iterdir() if work.path.exists() else ():
+            if path != work.parts:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
         write_yaml(work.config, dict(settings))
         return work
 

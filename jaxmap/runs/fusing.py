@@ -213,7 +213,7 @@ def map_on_workers(
         JaxmapError: as `map_observations`, and as `run_perception`.
     """
     check_shareable(config)
-    perceived = plan_run(source, config, lambda line: None, keep=True, in_tiles=True)
+    perceived = plan_run(source, config, notify, keep=True, in_tiles=True)
     keeper = perceived.keeper
     assert keeper is not None
     folder.check_apart(perceived.source, perceived.images, (config.poses, config.calibration, config.model))
@@ -225,7 +225,7 @@ def map_on_workers(
         # What chooses frames and poses has done so.
         usual = MapConfig()
         of_kept = replace(config, **{name: getattr(usual, name) for name in CHOSEN_ANEW if name != "strict"})
-        plan = plan_run(str(work.observations), of_kept, notify, shared=share(config, workers))
+        plan = plan_run(str(work.observations), of_kept, lambda line: None, shared=share(config, workers))
         old = work.map if work.map.exists() else None
         metrics = run_shared(plan, of_kept, work, workers=workers, old=old, notify=notify, steps=steps)
         if not keep:
@@ -273,7 +273,8 @@ def run_shared(
     record = TileRecord(work.digest, work.sources, set(), {name: list(told) for name, told in work.told.items()})
     attributes = map_attributes(plan, log)
     assemble_map(folder.map, plan.grid, plan.labeller.classes, log.fused, attributes, work.files(), record)
-    details = {"shared": {"workers": workers.processes, **work.counts}}
+    where = workers.processes if workers.scheduler is None else workers.scheduler
+    details = {"shared": {"workers": where, **work.counts}}
     metrics = write_outputs(plan, folder, log, open_map(folder.map), details)
     shutil.rmtree(folder.parts, ignore_errors=True)
     if report:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -70,6 +71,46 @@ def test_errors_of_tasks_arrive_as_they_are():
     with pytest.raises(FrameError, match="it is damaged in frame 1; mend it") as caught:
         list(run_tasks(Workers(2), refuse, [1, 1]))
     assert (caught.value.what, caught.value.where, caught.value.fix) == ("it is damaged", "frame 1", "mend it")
+
+
+def square_slowly(number: int) -> int:
+    time.sleep(0.3)
+    return number * number
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_killed_and_started_again_gets_what_is_left():
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    started: list[subprocess.Popen] = []
+
+    def start(*words: str) -> None:
+        command = [sys.executable, "-m", "dask", *words, "--no-dashboard"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        started.append(subprocess.Popen(command, env=environment, **quiet))
+
+    def start_both() -> None:
+        start("scheduler", "--host", "127.0.0.1", "--port", address.rpartition(":")[2])
+        start("worker", f"tcp://{address}", "--nthreads", "1", "--no-nanny")
+
+    try:
+        start_both()
+        results: dict[int, int] = {}
+        for task, result in run_tasks(Workers(scheduler=f"tcp://{address}"), square_slowly, range(12)):
+            assert task not in results
+            results[task] = result
+            if len(results) == 3:
+                for process in started:
+                    process.kill()
+                start_both()
+        assert results == {number: number * number for number in range(12)}
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
 
 
 @pytest.mark.slow
