@@ -309,6 +309,7 @@ def keep_frames(keeper: Keeper, folder: RunFolder, indices: Sequence[int]) -> It
     for prepared in keeper.frames(folder.observations, indices):
         if prepared.frame is not None and prepared.index in keeper.seen.key_frames:
             assert prepared.rectified is not None
+            # At full size: maps draw their own pictures, of any size, from these.
             write_key_frame(folder, prepared.index, prepared.rectified, None, (), large=True)
         yield KeptFrame(prepared.ref.name, prepared.fault, prepared.stages_s)
 

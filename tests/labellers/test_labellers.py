@@ -182,15 +182,13 @@ def test_background_is_left_out_where_the_ground_has_a_class_of_its_own():
 
 
 @pytest.mark.parametrize("labeller", [PLANE, HARD, SOFT, make_no_labeller()], ids=lambda one: one.name)
-def test_a_labeller_draws_where_its_labels_depend_on_the_key(rng, labeller):
-    labels, shares = (
-        np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8),
-        np.zeros((HEIGHT_PX, WIDTH_PX, len(CLASSES)), np.float32),
-    )
+def test_a_labeller_draws_where_its_labels_depend_on_the_key(labeller):
+    labels, points = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8), beach(np.random.default_rng(0))
+    shares = np.zeros((*labels.shape, len(CLASSES)), np.float32)
     frame = frame_of(labels=labels) if labeller.needs == "labels" else frame_of(class_probabilities=shares)
 
     def label(key):
-        return label_points(labeller, frame, cloud_of(beach(rng), ALL), labeller.params, key)[0]
+        return label_points(labeller, frame, cloud_of(points, ALL), labeller.params, key)[0]
 
     traced = jax.make_jaxpr(label)(jax.random.key(0)).jaxpr
     assert any(traced.invars[0] in equation.invars for equation in traced.eqns) == labeller.draws
