@@ -183,8 +183,8 @@ def test_background_is_left_out_where_the_ground_has_a_class_of_its_own():
 
 @pytest.mark.parametrize("labeller", [PLANE, HARD, SOFT, make_no_labeller()], ids=lambda one: one.name)
 def test_a_labeller_draws_where_its_labels_depend_on_the_key(labeller):
-    labels, points = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8), beach(np.random.default_rng(0))
-    shares = np.zeros((*labels.shape, len(CLASSES)), np.float32)
+    labels, points = jnp.zeros((HEIGHT_PX, WIDTH_PX), jnp.uint8), beach(np.random.default_rng(0))
+    shares = jnp.zeros((*labels.shape, len(CLASSES)), jnp.float32)
     frame = frame_of(labels=labels) if labeller.needs == "labels" else frame_of(class_probabilities=shares)
 
     def label(key):
