@@ -217,7 +217,7 @@ class Source:
             raise JaxmapError(
                 f"{width} x {depth} cells are more than the {most_cells:,} that one map of {form} holds",
                 where=self.where,
-                fix="map with larger voxels, or within bounds (--grid)",
+                fix="map with larger voxels, or within --grid.lower-m and --grid.upper-m",
             )
         whole = _unknown_columns(len(self.classes), (width, depth))
         layers = {name: np.full((width, depth), np.nan, np.float32) for name in self.reader.attributes.layers}
