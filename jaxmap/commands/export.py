@@ -41,7 +41,13 @@ def main(words: Sequence[str]) -> int:
     folder, console = RunFolder(arguments.run), Console()
     folder.settle_for_reading()
     with console.steps("exporting", "forms", len(arguments.format)) as advance:
-        options = dict(colours=arguments.colours, notify=console.notify, advance=advance)
-        written = write_exports(folder, open_map(folder.map), arguments.format, **options)
+        written = write_exports(
+            folder,
+            open_map(folder.map),
+            arguments.format,
+            colours=arguments.colours,
+            notify=console.notify,
+            advance=advance,
+        )
     console.result(arguments.run, written)
     return 0

@@ -89,8 +89,9 @@ def cubes(source: Source, parts: Int[np.ndarray, "3"]) -> Iterator[_Cubes]:
         label = np.asarray(voxel_labels(voxel_map, params, rule))[own][here]
         low = [side.indices(size)[0] for side, size in zip(own, voxel_map.grid.shape[:2], strict=True)]
         index = (at + np.asarray(voxel_map.grid.first) + [*low, 0]) * parts
-        each = [np.repeat(column, len(within)) for column in (values[0][here].astype(np.float64) + prior, label, solid)]
-        yield (index[:, None] + within).reshape(-1, 3), *each
+        log_odds = values[0][here].astype(np.float64) + prior
+        log_odds, label, solid = (np.repeat(column, len(within)) for column in (log_odds, label, solid))
+        yield (index[:, None] + within).reshape(-1, 3), log_odds, label, solid
 
 
 def _cube(source: Source) -> tuple[float, Int[np.ndarray, "3"]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -219,7 +219,7 @@ class Source:
                 where=self.where,
                 fix="map with larger voxels, or within --grid.lower-m and --grid.upper-m",
             )
-        whole = _unknown_columns(len(self.classes), (width, depth))
+        whole: Any = unknown_top(len(self.classes), (width, depth))
         layers = {name: np.full((width, depth), np.nan, np.float32) for name in self.reader.attributes.layers}
         for corner, top, known, _ in self.columns():
             start = np.asarray(corner) - low
@@ -247,13 +247,13 @@ class Source:
         return columns
 
 
-def _unknown_columns(classes: int, shape: tuple[int, int]) -> TopDown:
-    return TopDown(
-        np.full((classes, *shape), np.nan, np.float32),
-        np.full(shape, IGNORE, np.uint8),
-        np.full(shape, np.nan, np.float32),
-        np.zeros(shape, bool),
-    )
+def unknown_top(classes: int, shape: tuple[int, int]) -> TopDown:
+    """A top-down map of which nothing is known yet, NumPy."""
+    probability: Any = np.full((classes, *shape), np.nan, np.float32)
+    label: Any = np.full(shape, IGNORE, np.uint8)
+    height_m: Any = np.full(shape, np.nan, np.float32)
+    observed: Any = np.zeros(shape, bool)
+    return TopDown(probability, label, height_m, observed)
 
 
 def absolute(layers: Mapping[str, Float[np.ndarray, "X Y"]], site_z_m: float) -> dict[str, Float[np.ndarray, "X Y"]]:

@@ -12,11 +12,11 @@ import numpy as np
 from jaxmap.datasets.poses import read_poses
 from jaxmap.errors import JaxmapError
 from jaxmap.export.formats import FORMATS, OF_EACH_RUN
-from jaxmap.export.source import KeyFrame, Pinholes, Source, Track
+from jaxmap.export.source import Colours, KeyFrame, Pinholes, Source, Track
 from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import read_bytes
 from jaxmap.mapping.store import MapReader
-from jaxmap.report.image_colours import SeenFrame, image_colours
+from jaxmap.report.image_colours import SeenFrame, brightest_of, image_colours
 from jaxmap.report.run_page import find_pictures, seen_frames
 from jaxmap.runs.folder import RunFolder
 
@@ -56,14 +56,11 @@ def write_exports(
             where=folder.path,
             fix="export with --colours classes, or map again",
         )
-    seen = [*frames.values()]
-    source = Source(
-        reader,
-        folder.map,
-        _read_track(folder, reader, frames),
-        (lambda points_world, label: image_colours(points_world, seen)) if colours == "images" else None,
-        notify,
-    )
+    of_points: Colours | None = None
+    if colours == "images":
+        seen, brightest = [*frames.values()], brightest_of([*frames.values()])
+        of_points = lambda points_world, label: image_colours(points_world, seen, brightest)  # noqa: E731
+    source = Source(reader, folder.map, _read_track(folder, reader, frames), of_points, notify)
     written: list[str] = []
     for done, name in enumerate(dict.fromkeys(formats)):
         paths = [folder.path / file for file in FORMATS[name].files]
