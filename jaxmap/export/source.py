@@ -54,45 +54,54 @@ class Columns(NamedTuple):
         return height_m if surface is None else np.where(self.top.observed & ~np.isnan(surface), surface, height_m)
 
 
+class Camera(NamedTuple):
+    """A rectified camera: focal lengths, principal point and size of its image, in pixels."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+
+
 class KeyFrame(NamedTuple):
-    """A frame of which the run kept the rectified left image (PNG)."""
+    """A frame of which the run kept a picture.
+
+    Attributes:
+        timestamp_s: its time.
+        T_world_camera: pose of the rectified left camera, relative to the site origin.
+        camera: of the picture.
+        image: the content of its file.
+        form: `png` or `webp`.
+    """
 
     timestamp_s: float
     T_world_camera: Float64[np.ndarray, "4 4"]
+    camera: Camera
     image: bytes
-
-
-class Pinholes(NamedTuple):
-    """The rectified left camera: focal lengths, principal point and size of the image, in pixels."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
+    form: str
 
 
 @dataclass(frozen=True)
 class Track:
-    """Where the left camera was: poses in the map's world, relative to the site origin, and what it saw."""
+    """Where the rectified left camera was: poses in the map's world, relative to the site origin, and its key frames."""
 
     timestamps_s: Float64[np.ndarray, "N"] = field(default_factory=lambda: np.zeros(0))
     T_world_camera: Float64[np.ndarray, "N 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    camera: Pinholes | None = None
     key_frames: Sequence[KeyFrame] = ()
 
     @property
     def quaternions(self) -> Float64[np.ndarray, "N 4"]:
         """The rotations of the poses as x, y, z, w."""
-        return quaternions(self.T_world_camera)
+        from scipy.spatial.transform import Rotation
 
-
-def quaternions(T: Float64[np.ndarray, "N 4 4"]) -> Float64[np.ndarray, "N 4"]:
-    """The rotations of transforms as x, y, z, w."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True).reshape(-1, 4) if len(T) else np.zeros((0, 4))
+        rotations = self.T_world_camera[:, :3, :3]
+        return (
+            Rotation.from_matrix(rotations).as_quat(canonical=True).reshape(-1, 4)
+            if len(rotations)
+            else np.zeros((0, 4))
+        )
 
 
 @dataclass(frozen=True, eq=False)
