@@ -85,7 +85,7 @@ class KeyFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Track:
-    """Where the rectified left camera was: poses in the map's world, relative to the site origin, and its key frames."""
+    """Where the rectified left camera was, relative to the site origin, and its key frames."""
 
     timestamps_s: Float64[np.ndarray, "N"] = field(default_factory=lambda: np.zeros(0))
     T_world_camera: Float64[np.ndarray, "N 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -97,11 +97,7 @@ class Track:
         from scipy.spatial.transform import Rotation
 
         rotations = self.T_world_camera[:, :3, :3]
-        return (
-            Rotation.from_matrix(rotations).as_quat(canonical=True).reshape(-1, 4)
-            if len(rotations)
-            else np.zeros((0, 4))
-        )
+        return Rotation.from_matrix(rotations).as_quat(canonical=True) if len(rotations) else np.zeros((0, 4))
 
 
 @dataclass(frozen=True, eq=False)
