@@ -21,6 +21,7 @@ from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, top_down
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.labels import IGNORE, class_colours
+from jaxmap.mapping.arrays import TILE
 from jaxmap.mapping.store import MapReader
 
 Colours = Callable[[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N"]], UInt8[np.ndarray, "N 3"]]
@@ -179,10 +180,12 @@ class Source:
             at = voxels.index[:, :2]
             keep = ((at >= low) & (at < high)).all(axis=-1)
             if keep.any():
-                moved = voxels.index[keep] + np.array([*(corner - low), 0], np.int32)
-                yield OccupiedVoxels(
-                    moved, voxels.centres_world[keep], voxels.label[keep], voxels.probability[keep], voxels.voxel_size_m
-                )
+                index = voxels.index + np.array([*(corner - low), 0], np.int32)
+                # In the order of the tiles: a map in memory is written as it is from disk.
+                tile = index[:, :2] // TILE[:2]
+                order = np.lexsort((tile[:, 1], tile[:, 0]))
+                order = order[keep[order]]
+                yield OccupiedVoxels(index[order], *(leaf[order] for leaf in voxels[1:4]), voxels.voxel_size_m)
 
     def columns(self, margin: int = 0) -> Iterator[Columns]:
         """The top-down map, block by block, with as many columns around each as there are."""
