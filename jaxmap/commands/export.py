@@ -19,7 +19,8 @@ class ExportArguments:
 
     Maps of any size are gone through tile by tile. Without --format: PLY (occupied voxels), GeoTIFF (top-down map) and
     PNG. Where the run has an ensemble, the GeoTIFF holds its layers, and a second PNG shows what the map may have
-    missed.
+    missed. For COLMAP and what reads its models, colmap/ holds cameras.txt, images.txt, points3D.txt and the rectified
+    images.
     """
 
     run: tyro.conf.Positional[Path]

@@ -25,6 +25,7 @@ from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.host.replacement import Replacement
 from jaxmap.mapping.store import MapReader, holds_map, stray_maps
+from jaxmap.report.detail import FOLDER
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
 from jaxmap.runs.config import OBSERVATIONS
 from jaxmap.stereo.front_end import RectifiedFrame
@@ -58,7 +59,7 @@ class RunFolder:
         return locked(self.path)
 
     @contextmanager
-    def writing(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> Iterator[RunFolder]:
+    def writing(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> Iterator[RunFolder]:
         """Begins a run and yields the folder it is to write into, see `begin`.
 
         A run that is replaced stays until the block has ended without an error.
@@ -70,8 +71,13 @@ class RunFolder:
         with self._replacement.written(keep=lambda: holds_map(work.map)):
             yield work
 
-    def begin(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
+    def begin(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> RunFolder:
         """Writes the resolved settings (`Plan.settings`), or checks that the run here can be resumed with them.
+
+        Args:
+            settings: as plain values.
+            resume: go on with what is there; None for work that cannot be resumed.
+            overwrite: replace what is there.
 
         Returns:
             Where to write: here, or where a run is replaced, a folder within.
@@ -89,10 +95,11 @@ class RunFolder:
             check_same_settings(work.config, dict(settings))
             return work
         if not overwrite and (used or holds_map(replacing.map)):
+            going_on = "" if resume is None else "resume it (--resume), "
             raise JaxmapError(
                 "the folder holds a run already",
                 where=self.path,
-                fix="resume it (--resume), replace it (--overwrite), or choose another folder",
+                fix=f"{going_on}replace it (--overwrite), or choose another folder",
             )
         self._check_own()
         self._replacement.discard()
@@ -112,11 +119,11 @@ class RunFolder:
 
     @property
     def _files(self) -> tuple[Path, ...]:
-        report = self.path / "report.html"
+        pages = (self.path / "report.html", self.path / "explain.html")
         # Scores are of the map that is there: they go with it.
         scored = (self.scores, self.errors, self.pose_scores)
         derived = [self.path / file for form in FORMATS.values() for file in form.files]
-        return (*derived, self.metrics, self.poses, self.frames, report, self.config, *scored)
+        return (*derived, self.metrics, self.poses, self.frames, *pages, self.config, *scored)
 
     def check_apart(self, source: str, images: Iterable[Path], inputs: Iterable[Path | None]) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
@@ -161,7 +168,7 @@ class RunFolder:
 
     def _outputs(self) -> Iterator[Path]:
         """What an earlier run has written, and nothing else."""
-        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, *self._files)
+        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, self.path / FOLDER, *self._files)
         for picture in self.pictures.glob("*"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 yield picture

@@ -21,6 +21,7 @@ from scenes import frame_name, pose, timestamp_s
 
 import jaxmap.mapping.observations as store
 from jaxmap.datasets.poses import write_tum
+from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.mapping.observations import open_observations
 from jaxmap.runs.config import config_of_observations
@@ -68,7 +69,7 @@ def test_every_frame_is_kept_with_settings_metrics_and_pictures(perceived, scene
     assert metrics["digest"] == observations.attributes.digest()
     tree = yaml.safe_load((perceived / "config.yaml").read_text())
     assert tree["sequence"] == str(scene_folder) and tree["labeller"] == "plane" and "grid" not in tree
-    assert len(list((perceived / "pictures").glob("*_left.png"))) == 4
+    assert len(list((perceived / "pictures").glob("*_left.png"))) == FRAMES
 
 
 def test_the_plan_and_the_frames_are_those_of_the_sequence(perceived, scene_folder):
@@ -232,6 +233,16 @@ def test_a_damaged_frame_is_left_out_with_its_reason(copy):
     prepared = list(plan_of(copy).prepare())
     assert [one.frame is None for one in prepared] == [index == 1 for index in range(FRAMES)]
     assert "remove that folder and run jaxmap perceive again" in str(prepared[1].fault)
+
+
+@pytest.mark.slow
+def test_the_members_of_an_ensemble_stand_where_they_stand_over_images(perceived, scene_folder):
+    direct, again = (
+        planned(scene_folder, ensemble={"members": 2}),
+        plan_of(perceived, ensemble=EnsembleOptions(members=2)),
+    )
+    for one, other in zip(frames_of(again), frames_of(direct), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.mark.slow
