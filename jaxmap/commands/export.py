@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -45,7 +45,7 @@ def main(words: Sequence[str]) -> int:
     written: list[str] = []
     if formats:
         with console.steps("exporting", "forms", len(formats)) as advance:
-            options = dict(colours=arguments.colours, notify=console.notify, advance=advance)
+            options: Any = dict(colours=arguments.colours, notify=console.notify, advance=advance)
             written += write_exports(folder, open_map(folder.map), formats, **options)
     if "colmap" in arguments.format:
         from jaxmap.runs.colmap import export_colmap

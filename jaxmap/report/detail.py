@@ -34,7 +34,7 @@ class Part(NamedTuple):
     """A part of a map: where it lies, counted in parts, how many voxels it has, and these, compressed."""
 
     place: tuple[int, int]
-    count: int
+    voxels: int
     packed: bytes
 
 
@@ -86,8 +86,8 @@ def detail_section(source: Source, page: Path, background: str, T_map_world: Flo
     embedded: list[Part] | None = []
     places, size, total = [], 0, 0
     for part in parts_of(source):
-        places.append((*part.place, part.count))
-        total += part.count
+        places.append((*part.place, part.voxels))
+        total += part.voxels
         size += len(part.packed) * 4 // 3
         if embedded is not None:
             embedded.append(part)
