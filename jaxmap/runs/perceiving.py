@@ -245,7 +245,7 @@ def resolved_settings(seen: Perception, config: PerceiveConfig) -> dict[str, Any
 
 def outputs_of(folder: RunFolder) -> Iterable[Path]:
     """What a perception writes into its folder."""
-    return (folder.observations, folder.config, folder.metrics, *folder.pictures.glob("[0-9]*_*.png"))
+    return (folder.observations, folder.config, folder.metrics, *folder.pictures.glob("[0-9]*_*.*"))
 
 
 @contextmanager
@@ -327,7 +327,8 @@ def run_perception(
             raise prepared.fault
         if prepared.frame is not None and prepared.index in seen.key_frames:
             assert prepared.rectified is not None
-            write_key_frame(folder, prepared.index, prepared.rectified, None, ())
+            large = seen.key_frames[prepared.index]
+            write_key_frame(folder, prepared.index, prepared.rectified, None, (), large=large)
         log.add(prepared)
         on_frame(there + log.perceived + len(log.skipped))
     if not there + log.perceived:

@@ -215,7 +215,7 @@ def test_a_faulty_input_leaves_the_run_that_is_there(cli, scene_copy, finished_r
     ],
 )
 def test_a_fault_of_our_own_and_an_interrupt_are_one_line_too(raised, status, line, cli, scene_folder, monkeypatch):
-    def broken(*_: object) -> None:
+    def broken(*_: object, **options: object) -> None:
         raise raised
 
     monkeypatch.setattr("jaxmap.runs.mapping_plan.plan_run", broken)
