@@ -327,8 +327,8 @@ def run_perception(
             raise prepared.fault
         if prepared.frame is not None and prepared.index in seen.key_frames:
             assert prepared.rectified is not None
-            large = seen.key_frames[prepared.index]
-            write_key_frame(folder, prepared.index, prepared.rectified, None, (), large=large)
+            # At full size: maps draw their own pictures, of any size, from these.
+            write_key_frame(folder, prepared.index, prepared.rectified, None, (), large=True)
         log.add(prepared)
         on_frame(there + log.perceived + len(log.skipped))
     if not there + log.perceived:

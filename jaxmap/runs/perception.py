@@ -83,11 +83,10 @@ class Perception:
 
         With observations, those that have a picture.
         """
-        count = len(self.sequence.frames)
+        there = list(range(len(self.sequence.frames)))
         if self.observations is not None:
-            pictures = {index: self.observations.picture(index) for index in range(count)}
-            return {index: path.suffix == ".png" for index, path in pictures.items() if path is not None}
-        spaced = np.linspace(0, count - 1, _KEY_FRAMES).round().astype(int).tolist()
+            there = [index for index in there if self.observations.picture(index) is not None]
+        spaced = [there[int(place)] for place in np.linspace(0, len(there) - 1, _KEY_FRAMES).round()] if there else []
         # Of frames taken twice, in a short sequence, the large one counts.
         small = dict.fromkeys(spaced, False)
         return dict(sorted((small | dict.fromkeys(spaced[::_LARGE_EVERY], True)).items()))

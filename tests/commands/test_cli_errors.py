@@ -76,6 +76,13 @@ def without_metrics(given: Given) -> Path:
     return run
 
 
+def damaged_observations(given: Given) -> Path:
+    folder = given.folder / "observations.zarr"
+    folder.mkdir()
+    (folder / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {}}')
+    return folder
+
+
 def below_a_file(given: Given) -> Path:
     (given.folder / "file").write_text("")
     return given.folder / "file" / "run"
@@ -89,6 +96,8 @@ def trained(given: Given, fault: str, *words: object) -> list[object]:
 FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "unknown command": (2, lambda given: ["mapp"]),
     "check: no sequence": (1, lambda given: ["check", given.folder / "nowhere"]),
+    "perceive: no sequence": (1, lambda given: ["perceive", given.folder / "nowhere", "--out", given.folder / "run"]),
+    "map: damaged observations": (1, lambda given: ["map", damaged_observations(given), "--out", given.folder / "run"]),
     "map: pose with a word": (1, lambda given: mapped(given, damage=worded_pose)),
     "map: truncated image, strictly": (1, lambda given: mapped(given, "--strict", damage=truncated)),
     "map: all frames unreadable": (1, lambda given: mapped(given, damage=all_unreadable)),

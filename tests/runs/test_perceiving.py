@@ -69,7 +69,7 @@ def test_every_frame_is_kept_with_settings_metrics_and_pictures(perceived, scene
     assert metrics["digest"] == observations.attributes.digest()
     tree = yaml.safe_load((perceived / "config.yaml").read_text())
     assert tree["sequence"] == str(scene_folder) and tree["labeller"] == "plane" and "grid" not in tree
-    assert len(list((perceived / "pictures").glob("*_left.*"))) == FRAMES
+    assert len(list((perceived / "pictures").glob("*_left.png"))) == FRAMES
 
 
 def test_the_plan_and_the_frames_are_those_of_the_sequence(perceived, scene_folder):
