@@ -17,13 +17,8 @@ from jaxmap.host.files import atomic_path
 from jaxmap.mapping.observations import read_attributes
 from jaxmap.report.drive_view import seen_frames
 from jaxmap.report.image_colours import image_colours
-<<<<<<< HEAD
 from jaxmap.report.run_contents import find_pictures
-from jaxmap.runs.config import load_config
-=======
-from jaxmap.report.run_contents import read_run
 from jaxmap.runs.config import load_config, observations_in
->>>>>>> observations
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.run_frames import read_run_frames
 from jaxmap.stereo.front_end import StereoFrontEnd
