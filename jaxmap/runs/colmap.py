@@ -14,10 +14,11 @@ from jaxmap.export.colmap import FILES, write_colmap
 from jaxmap.export.source import Source
 from jaxmap.host.bounded_text import read_json, read_yaml
 from jaxmap.host.files import atomic_path
+from jaxmap.mapping.observations import read_attributes
 from jaxmap.report.drive_view import seen_frames
 from jaxmap.report.image_colours import image_colours
 from jaxmap.report.run_contents import find_pictures
-from jaxmap.runs.config import load_config
+from jaxmap.runs.config import load_config, observations_in
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.run_frames import read_run_frames
 from jaxmap.stereo.front_end import StereoFrontEnd
@@ -64,6 +65,8 @@ def _write_images(folder: RunFolder, names: set[str]) -> None:
     from PIL import Image
 
     config, source = load_config(str(folder.config)), str(read_yaml(folder.config)["sequence"])
+    if (perceived := observations_in(source)) is not None:
+        source = read_attributes(perceived).sequence
     # Only images are wanted: poses that took long to find are not sought again.
     config = replace(config, poses=folder.poses, poses_world="auto") if str(config.poses) == "odometry" else config
     sequence = open_sequence(source, config)
