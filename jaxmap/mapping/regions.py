@@ -118,18 +118,30 @@ def regions_of(grid: GridSpec, shape: Shape, touching: Mapping[Tile, Sequence[in
         shape: of the dense tensor of a region, the same for all, so that the step is compiled once.
         touching: the tiles, with the frames that touch them.
     """
-    low, edges = _corner(grid), np.array(shape) // TILE
-    most = np.array(grid.shape) // TILE - edges
-    held: dict[Shape, list[Tile]] = {}
-    for tile in sorted(touching):
-        # The last ones along an axis are moved back, to lie within the grid.
-        place = np.minimum((np.array(tile) - low) // edges * edges, most)
-        x, y, z = ((place + low) * TILE).tolist()
-        held.setdefault((x, y, z), []).append(tile)
-    return [
-        Region(first, tuple(tiles), tuple(sorted({index for tile in tiles for index in touching[tile]})))
-        for first, tiles in held.items()
-    ]
+    edges = np.array(shape) // TILE
+    last = _corner(grid) + np.array(grid.shape) // TILE - edges
+    regions = []
+    for tiles in _boxes(sorted(touching), edges.tolist()):
+        # Where the tiles begin, or earlier, to lie within the grid.
+        x, y, z = (np.minimum(np.min(tiles, axis=0), last) * TILE).tolist()
+        frames = sorted({index for tile in tiles for index in touching[tile]})
+        regions.append(Region((x, y, z), tuple(tiles), tuple(frames)))
+    return regions
+
+
+def _boxes(tiles: list[Tile], edges: Sequence[int], axis: int = 0) -> Iterator[list[Tile]]:
+    """Groups of tiles, each within a box of these edges: strips along x, which are cut along y, and those along z.
+
+    Each begins at its first tile: a winding path, or a few tiles of it, takes fewer boxes than those of a fixed raster.
+    """
+    if axis == len(edges):
+        yield tiles
+        return
+    tiles = sorted(tiles, key=lambda tile: (tile[axis], tile))
+    while tiles:
+        strip = [tile for tile in tiles if tile[axis] < tiles[0][axis] + edges[axis]]
+        yield from _boxes(strip, edges, axis + 1)
+        tiles = tiles[len(strip) :]
 
 
 def region_shape(
