@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from annotated_types import Interval
 
 from jaxmap.commands.console import Console, Workers, check_bounds, check_workers, parse
 from jaxmap.errors import UsageError
@@ -60,6 +61,8 @@ class MapArguments:
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
     TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
+    devices: Annotated[int, Interval(ge=1)] | None = None
+    """On how many GPUs frames are fused, one on each at a time; by default on all. A CPU is one device."""
     view: bool = False
     """Show the run in the viewer of rerun while it goes on (pip install 'jaxmap[view]')."""
     view_save: Path | None = None
@@ -83,6 +86,7 @@ def main(words: Sequence[str]) -> int:
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.mapping.devices import choose_devices
     from jaxmap.report.recording import check_viewer
     from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.mapping import run_plan, unwatched
@@ -103,6 +107,7 @@ def main(words: Sequence[str]) -> int:
     with console.counted("odometry", "frames") as on_frame:
         keep = arguments.keep_observations
         plan = plan_run(arguments.sequence, config, console.notify, on_frame, keep=keep, in_tiles=True)
+    devices = choose_devices(arguments.devices, plan.members)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite
     with (
@@ -120,6 +125,7 @@ def main(words: Sequence[str]) -> int:
             on_frame=advance,
             watch=watch,
             profile=arguments.profile,
+            devices=devices,
         )
     return _tell(arguments, metrics, console)
 
