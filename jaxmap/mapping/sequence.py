@@ -117,7 +117,7 @@ def observed_frames(
     *,
     left_image: Callable[[FrameRef], ImageArray] | None = None,
     pose_errors: Float[np.ndarray, "N M 6"] | None = None,
-    first: int = 0,
+    indices: Sequence[int] | None = None,
     workers: int = 2,
     ahead: int = 4,
 ) -> Iterator[PreparedFrame]:
@@ -128,7 +128,7 @@ def observed_frames(
         left_image: reads the rectified left image of a frame, which is then delivered, as RGB, in place of the labels
             that are kept.
         pose_errors: of the members of an ensemble, for each frame.
-        first: index of the first frame.
+        indices: which frames; by default all.
         workers: threads.
         ahead: frames in the making or waiting.
     """
@@ -155,7 +155,7 @@ def observed_frames(
             frame = replace(frame, **kept | {"image": to_device(as_rgb(left))})
         return replace(prepared, frame=frame, rectified=rectified, stages_s=stages_s)
 
-    return prefetch(prepare, range(first, len(observations.frames)), workers, ahead)
+    return prefetch(prepare, range(len(observations.frames)) if indices is None else indices, workers, ahead)
 
 
 def as_prepared(

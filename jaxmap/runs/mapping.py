@@ -90,11 +90,11 @@ def run_plan(
     saved_s = resumed_s = time.perf_counter()
     if plan.keeper is not None:
         plan.keeper.begin(folder.observations)
-    frames = plan.prepare(log.next_index, keep_in=folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
+    frames = plan.prepare(range(log.next_index, len(plan.sequence.frames)), keep_in=folder.observations)
     options: dict[str, Any] = {"strict": strict, "form": form, "cover": memory.cover}
     run = run_on_devices(plan.mapper, voxel_map, frames, plan.params, plan.key, devices, **options)
-    pictures = _Pictures(plan, folder)
+    pictures = Pictures(plan, folder)
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
@@ -129,11 +129,11 @@ def run_plan(
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    reader = memory.finish(voxel_map, _attributes(plan, log, voxel_map))
-    metrics = _write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
+    reader = memory.finish(voxel_map, map_attributes(plan, log, voxel_map))
+    metrics = write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
-    for note in _notes(plan, log, metrics):
+    for note in notes(plan, log, metrics):
         notify(f"note: {note}")
     return metrics
 
@@ -208,10 +208,10 @@ class _TiledMap:
         return open_map(self.path)
 
 
-def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: _Pictures) -> None:
+def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: Pictures) -> None:
     """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
     pictures.write()
-    memory.save(voxel_map, _attributes(plan, log, voxel_map))
+    memory.save(voxel_map, map_attributes(plan, log, voxel_map))
 
 
 def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
@@ -236,7 +236,7 @@ def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
     return score_disparity(rectified.disparity_px, truth_px)
 
 
-def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
+def notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
     said = {finding.kind for finding in plan.findings}
     if log.too_near and not said & {"near-limit", "vertical-disparity"}:
@@ -264,7 +264,7 @@ def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"no voxel is occupied: {reason}"
 
 
-def _write_outputs(
+def write_outputs(
     plan: Plan, folder: RunFolder, log: RunLog, reader: MapReader, details: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes all that a run leaves beside its map, and returns its metrics, the details among them."""
@@ -320,7 +320,8 @@ def _check_same(plan: Plan, voxel_map: VoxelMap, log: RunLog, where: Path) -> No
         )
 
 
-def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
+def map_attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap | None = None) -> MapAttributes:
+    """What is stored beside the map, which is looked at where it has an ensemble."""
     log.digest = plan.digest(log.next_index)
     return MapAttributes(
         crs=plan.sequence.crs,
@@ -328,11 +329,11 @@ def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
         T_world_source=plan.sequence.T_world_source,
         fusion=plan.fusion,
         progress=log.as_json(),
-        layers=named_layers(voxel_map, plan.params.fusion, plan.rule),
+        layers={} if voxel_map is None else named_layers(voxel_map, plan.params.fusion, plan.rule),
     )
 
 
-class _Pictures:
+class Pictures:
     """Key frames that wait for their pictures to be written."""
 
     def __init__(self, plan: Plan, folder: RunFolder) -> None:
