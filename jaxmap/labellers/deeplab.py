@@ -183,6 +183,7 @@ def make_logits_labeller(
         bijectors={"temperature": positive(0.02, 50.0)},
         soft=options.soft,
         ground=ground,
+        draws=False,
     )
 
 

@@ -70,6 +70,10 @@ def newer(given: Given) -> Path:
     return run
 
 
+def copied(given: Given) -> Path:
+    return Path(shutil.copytree(given.run, given.folder / "copy"))
+
+
 def without_metrics(given: Given) -> Path:
     run = Path(shutil.copytree(given.run, given.folder / "no_metrics"))
     (run / "metrics.json").unlink()
@@ -97,6 +101,8 @@ FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "map: out of range": (2, lambda given: mapped(given, "--plane.threshold-m", "-1")),
     "view: no run": (1, lambda given: ["view", given.folder / "nowhere", "--save", given.folder / "f.rrd"]),
     "evaluate: no run": (1, lambda given: ["evaluate", given.folder / "nowhere", given.folder / "truth.tif"]),
+    "explain: outside the map": (2, lambda given: ["explain", copied(given), "--at", "-900", "0"]),
+    "merge: one run": (2, lambda given: ["merge", given.run, "--out", given.folder / "run"]),
     "export: newer map": (1, lambda given: ["export", newer(given)]),
     "report: no metrics": (1, lambda given: ["report", without_metrics(given)]),
     "demo: out lies in a file": (1, lambda given: ["demo", "--out", below_a_file(given)]),
