@@ -85,6 +85,9 @@ def test_a_map_without_classes_or_crs_is_written_or_refused_whole(name, tmp_path
     ],
 )
 def test_a_missing_library_is_named_with_its_command(name, module, tmp_path, monkeypatch) -> None:
+    # What is imported for the first time meanwhile would never find it again.
+    for loaded in ("laspy", "lazrs", "mcap_protobuf.writer"):
+        import_module(loaded)
     for loaded in (module, f"{module}.writer"):
         monkeypatch.setitem(__import__("sys").modules, loaded, None)
     with pytest.raises(JaxmapError, match=r"is not installed.*pip install 'jaxmap\[formats\]'"):
