@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64, Int, UInt8
 
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
@@ -21,6 +21,7 @@ from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, top_down
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.labels import IGNORE, class_colours
+from jaxmap.mapping.arrays import TILE
 from jaxmap.mapping.store import MapReader
 
 Colours = Callable[[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N"]], UInt8[np.ndarray, "N 3"]]
@@ -53,46 +54,55 @@ class Columns(NamedTuple):
         height_m = np.asarray(self.top.height_m)
         return height_m if surface is None else np.where(self.top.observed & ~np.isnan(surface), surface, height_m)
 
+    def moved(self, x: Int[np.ndarray, "N"], y: Int[np.ndarray, "N"], corner: tuple[int, int]) -> tuple[Any, Any]:
+        """Indices of this part's cells in an array that begins at a corner of the grid."""
+        return x + self.corner[0] - corner[0], y + self.corner[1] - corner[1]
+
+
+class Camera(NamedTuple):
+    """A rectified camera: focal lengths, principal point and size of its image, in pixels."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+
 
 class KeyFrame(NamedTuple):
-    """A frame of which the run kept the rectified left image (PNG)."""
+    """A frame of which the run kept a picture.
+
+    Attributes:
+        timestamp_s: its time.
+        T_world_camera: pose of the rectified left camera, relative to the site origin.
+        camera: of the picture.
+        image: the content of its file.
+        form: `png` or `webp`.
+    """
 
     timestamp_s: float
     T_world_camera: Float64[np.ndarray, "4 4"]
+    camera: Camera
     image: bytes
-
-
-class Pinholes(NamedTuple):
-    """The rectified left camera: focal lengths, principal point and size of the image, in pixels."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
+    form: str
 
 
 @dataclass(frozen=True)
 class Track:
-    """Where the left camera was: poses in the map's world, relative to the site origin, and what it saw."""
+    """Where the rectified left camera was, relative to the site origin, and its key frames."""
 
     timestamps_s: Float64[np.ndarray, "N"] = field(default_factory=lambda: np.zeros(0))
     T_world_camera: Float64[np.ndarray, "N 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    camera: Pinholes | None = None
     key_frames: Sequence[KeyFrame] = ()
 
     @property
     def quaternions(self) -> Float64[np.ndarray, "N 4"]:
         """The rotations of the poses as x, y, z, w."""
-        return quaternions(self.T_world_camera)
+        from scipy.spatial.transform import Rotation
 
-
-def quaternions(T: Float64[np.ndarray, "N 4 4"]) -> Float64[np.ndarray, "N 4"]:
-    """The rotations of transforms as x, y, z, w."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True).reshape(-1, 4) if len(T) else np.zeros((0, 4))
+        rotations = self.T_world_camera[:, :3, :3]
+        return Rotation.from_matrix(rotations).as_quat(canonical=True) if len(rotations) else np.zeros((0, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +184,13 @@ class Source:
             at = voxels.index[:, :2]
             keep = ((at >= low) & (at < high)).all(axis=-1)
             if keep.any():
-                moved = voxels.index[keep] + np.array([*(corner - low), 0], np.int32)
-                yield OccupiedVoxels(
-                    moved, voxels.centres_world[keep], voxels.label[keep], voxels.probability[keep], voxels.voxel_size_m
-                )
+                index = voxels.index + np.array([*(corner - low), 0], np.int32)
+                # In the order of the tiles: a map in memory is written as it is from disk.
+                tile = index[:, :2] // TILE[:2]
+                order = np.lexsort((tile[:, 1], tile[:, 0]))
+                order = order[keep[order]]
+                centres, label, probability = (leaf[order] for leaf in voxels[1:4])
+                yield OccupiedVoxels(index[order], centres, label, probability, voxels.voxel_size_m)
 
     def columns(self, margin: int = 0) -> Iterator[Columns]:
         """The top-down map, block by block, with as many columns around each as there are."""
@@ -196,11 +209,11 @@ class Source:
             inner = tuple(slice(low - a, high - a) for a, (low, high) in zip(lows, sides, strict=True))
             yield Columns((x, y), top, layers, (inner[0], inner[1]))
 
-    def whole(self, most_cells: int, form: str) -> Columns | None:
-        """The observed part of the top-down map as one, for forms that are one array; None where nothing was observed.
+    def observed_box(self, most_cells: int, form: str) -> tuple[tuple[int, int], tuple[int, int]] | None:
+        """Corner and size of the observed part of the top-down map, in columns; None where nothing was observed.
 
         Args:
-            most_cells: that it may have.
+            most_cells: that a form holds.
             form: its name, for the message.
 
         Raises:
@@ -212,53 +225,63 @@ class Source:
                 low, high = np.minimum(low, cells.min(0) + corner), np.maximum(high, cells.max(0) + 1 + corner)
         if (high <= low).any():
             return None
-        width, depth = (high - low).tolist()
+        (x, y), (width, depth) = low.tolist(), (high - low).tolist()
         if width * depth > most_cells:
             raise JaxmapError(
                 f"{width} x {depth} cells are more than the {most_cells:,} that one map of {form} holds",
                 where=self.where,
-                fix="map with larger voxels, or within bounds (--grid)",
+                fix="map with larger voxels, or within --grid.lower-m and --grid.upper-m",
             )
-        whole = _unknown_columns(len(self.classes), (width, depth))
+        return (x, y), (width, depth)
+
+    def whole(self, most_cells: int, form: str) -> Columns | None:
+        """The observed part of the top-down map as one, for forms that are one array; see `observed_box`."""
+        box = self.observed_box(most_cells, form)
+        if box is None:
+            return None
+        corner, (width, depth) = box
+        whole: Any = unknown_top(len(self.classes), (width, depth))
         layers = {name: np.full((width, depth), np.nan, np.float32) for name in self.reader.attributes.layers}
-        for corner, top, known, _ in self.columns():
-            start = np.asarray(corner) - low
-            x, y = np.argwhere(top.observed).T
-            to = (x + start[0], y + start[1])
-            whole.probability[:, *to] = top.probability[:, x, y]
-            for into, values in zip(whole[1:], top[1:], strict=True):
+        for columns in self.columns():
+            x, y = np.argwhere(columns.top.observed).T
+            to = columns.moved(x, y, corner)
+            whole.probability[:, *to] = columns.top.probability[:, x, y]
+            for into, values in zip(whole[1:], columns.top[1:], strict=True):
                 into[to] = values[x, y]
-            for name, values in known.items():
+            for name, values in columns.layers.items():
                 layers[name][to] = values[x, y]
-        corner = (int(low[0]), int(low[1]))
         return Columns(corner, whole, layers, (slice(0, width), slice(0, depth)))
 
-    def observed_whole(self, most_cells: int, form: str) -> Columns:
-        """`whole`, where a form needs something.
-
-        Raises:
-            JaxmapError: nothing was observed, or it has more cells.
-        """
-        columns = self.whole(most_cells, form)
-        if columns is None:
-            raise JaxmapError(
-                f"nothing was observed: there is no map of {form}", where=self.where, fix="see the notes of its report"
-            )
-        return columns
+    def nothing_observed(self, form: str) -> JaxmapError:
+        """The error of a form that needs something."""
+        return JaxmapError(
+            f"nothing was observed: there is no map of {form}", where=self.where, fix="see the notes of its report"
+        )
 
 
-def _unknown_columns(classes: int, shape: tuple[int, int]) -> TopDown:
-    return TopDown(
-        np.full((classes, *shape), np.nan, np.float32),
-        np.full(shape, IGNORE, np.uint8),
-        np.full(shape, np.nan, np.float32),
-        np.zeros(shape, bool),
-    )
+def unknown_top(classes: int, shape: tuple[int, int]) -> TopDown:
+    """A top-down map of which nothing is known yet, NumPy."""
+    probability: Any = np.full((classes, *shape), np.nan, np.float32)
+    label: Any = np.full(shape, IGNORE, np.uint8)
+    height_m: Any = np.full(shape, np.nan, np.float32)
+    observed: Any = np.zeros(shape, bool)
+    return TopDown(probability, label, height_m, observed)
 
 
 def absolute(layers: Mapping[str, Float[np.ndarray, "X Y"]], site_z_m: float) -> dict[str, Float[np.ndarray, "X Y"]]:
     """The layers of a map with heights in the coordinate reference system of its site."""
     return {name: values + site_z_m if name == SURFACE else values for name, values in layers.items()}
+
+
+def stamp_ns(time_s: float) -> int:
+    """A time in whole nanoseconds, as logs count them.
+
+    Raises:
+        JaxmapError: it is negative, which a log cannot hold.
+    """
+    if time_s < 0:
+        raise JaxmapError(f"a frame has the time {time_s:g} s, logs begin at 0", fix="give times from 0 on")
+    return round(time_s * 1e9)
 
 
 def optional(module: str, package: str, what: str) -> ModuleType:

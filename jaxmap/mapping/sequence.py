@@ -143,7 +143,7 @@ def observed_frames(
                 if left_image is not None:
                     left = left_image(ref)
                 elif picture is not None:
-                    left = read_image(picture)
+                    left = _at_full_size(read_image(picture), observations.camera)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         assert prepared.rectified is not None and prepared.frame is not None
@@ -156,6 +156,13 @@ def observed_frames(
         return replace(prepared, frame=frame, rectified=rectified, stages_s=stages_s)
 
     return prefetch(prepare, range(len(observations.frames)) if indices is None else indices, workers, ahead)
+
+
+def _at_full_size(picture: ImageArray, camera: StereoCamera) -> ImageArray:
+    """A picture of a key frame, which may have been kept small, at the size of the images."""
+    import cv2
+
+    return cv2.resize(picture, (camera.width_px, camera.height_px))
 
 
 def as_prepared(

@@ -67,7 +67,7 @@ class Architecture:
         dilate_first: whether the unit whose stride is taken away is dilated too (torch), or only
             the units after it (TensorFlow).
         backbone_norm: whether batch norm follows the backbone's convolutions; a bias where not.
-        head_norm: the same of ASPP and decoder.
+        head_norm: the same of all other convolutions but the classifier.
         backbone_eps: epsilon of the backbone's batch norm.
         head_eps: epsilon of the head's.
         top_conv: whether MobileNetV2 or EfficientNet-Lite0 keeps its last 1x1 convolution (to 1280 channels).
@@ -82,7 +82,7 @@ class Architecture:
         decoder_convs: separable convolutions of the decoder.
         relief_channels: channels of relief that the decoder sees beside the low-level feature; 0 for images alone.
         align_corners: whether bilinear resizing maps corner pixels onto corner pixels.
-        dropout: share of ASPP features dropped while training.
+        dropout: share of the features of the ASPP, or of FCN's convolution, dropped while training.
         mean: input mean of R, G, B, on a scale of 0 to 1.
         std: input standard deviation, same scale.
 

@@ -245,7 +245,7 @@ def resolved_settings(seen: Perception, config: PerceiveConfig) -> dict[str, Any
 
 def outputs_of(folder: RunFolder) -> Iterable[Path]:
     """What a perception writes into its folder."""
-    return (folder.observations, folder.config, folder.metrics, *folder.pictures.glob("[0-9]*_*.png"))
+    return (folder.observations, folder.config, folder.metrics, *folder.pictures.glob("[0-9]*_*.*"))
 
 
 @contextmanager

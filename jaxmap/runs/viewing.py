@@ -135,7 +135,9 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
             if prepared.rectified is not None and prepared.frame is not None:
                 left = prepared.rectified.left
                 log.pose(T_world_camera[prepared.index])
-                log.left(left, pinhole(camera), camera.width_px)
+                # Observations have that of key frames alone.
+                if left.size:
+                    log.left(left, pinhole(camera), camera.width_px)
                 log.picture("disparity", colourise_disparity(prepared.rectified.disparity_px))
                 if classes and prepared.index in plan.key_frames:
                     number = int(voxel_map.frames_fused) - 1

@@ -140,8 +140,8 @@ def _architecture(
 
 def _of_family(options: NetworkOptions, classes: tuple[str, ...]) -> Architecture:
     if options.kind not in (None, "deeplab"):
-        backbone = options.backbone or "mobilenet_v2"
-        return torch_architecture(backbone, classes, output_stride=options.output_stride, kind=options.kind)
+        # Another stride may go only with another choice, of the decoder: both are set at once, by the caller.
+        return torch_architecture(options.backbone or "mobilenet_v2", classes, kind=options.kind)
     stride = options.output_stride or 16
     make = tf_architecture if options.family == "tf" else torch_architecture
     record = make(options.backbone or "mobilenet_v2", classes, output_stride=stride)

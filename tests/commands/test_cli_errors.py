@@ -80,6 +80,13 @@ def without_metrics(given: Given) -> Path:
     return run
 
 
+def damaged_observations(given: Given) -> Path:
+    folder = given.folder / "observations.zarr"
+    folder.mkdir()
+    (folder / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {}}')
+    return folder
+
+
 def below_a_file(given: Given) -> Path:
     (given.folder / "file").write_text("")
     return given.folder / "file" / "run"
@@ -93,6 +100,8 @@ def trained(given: Given, fault: str, *words: object) -> list[object]:
 FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "unknown command": (2, lambda given: ["mapp"]),
     "check: no sequence": (1, lambda given: ["check", given.folder / "nowhere"]),
+    "perceive: no sequence": (1, lambda given: ["perceive", given.folder / "nowhere", "--out", given.folder / "run"]),
+    "map: damaged observations": (1, lambda given: ["map", damaged_observations(given), "--out", given.folder / "run"]),
     "map: pose with a word": (1, lambda given: mapped(given, damage=worded_pose)),
     "map: truncated image, strictly": (1, lambda given: mapped(given, "--strict", damage=truncated)),
     "map: all frames unreadable": (1, lambda given: mapped(given, damage=all_unreadable)),
@@ -221,7 +230,7 @@ def test_a_faulty_input_leaves_the_run_that_is_there(cli, scene_copy, finished_r
     ],
 )
 def test_a_fault_of_our_own_and_an_interrupt_are_one_line_too(raised, status, line, cli, scene_folder, monkeypatch):
-    def broken(*_: object) -> None:
+    def broken(*_: object, **options: object) -> None:
         raise raised
 
     monkeypatch.setattr("jaxmap.runs.mapping_plan.plan_run", broken)

@@ -181,6 +181,15 @@ def test_of_another_kind_of_network_the_backbone_alone_is_kept(kind, name):
     assert again.architecture == record and again.fresh == ()
 
 
+def test_an_fcn_without_a_decoder_has_any_stride():
+    network = NetworkOptions(kind="fcn", decoder=False, output_stride=8)
+    for init in (None, saved()):
+        record = start_of(init, network).architecture
+        assert (record.name, record.output_stride, record.decoder) == ("FCN", 8, False)
+    with pytest.raises(JaxmapError, match="FCN-8s at output stride 8"):
+        start_of(None, replace(network, decoder=None))
+
+
 @pytest.mark.parametrize(
     ("kind", "options", "name"),
     [
