@@ -137,6 +137,8 @@ def _map_shared(arguments: MapArguments, folder: RunFolder, console: Console) ->
 
     if arguments.profile:
         raise UsageError("workers are not profiled", where="--profile", fix="leave --profile or the workers out")
+    if arguments.devices is not None:
+        raise UsageError("workers fuse on one device each", where="--devices", fix="leave --devices or the workers out")
     workers = executors.Workers(arguments.workers or 1, arguments.scheduler)
     config, tell = arguments.settings, (console.notify, console.steps)
     if observations_in(arguments.sequence) is not None:

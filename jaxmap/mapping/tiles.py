@@ -16,7 +16,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float32, Int
 
@@ -295,7 +295,9 @@ class MovingBlock:
         for tile in tiles_of(self.store.grid, np.stack([first, first + self._shape])):
             if (stored := self.store.read(tile)) is not None:
                 values[_part(np.asarray(tile) - offset)] = stored
-        return VoxelMap(jnp.array(values), to_device(frames_fused, np.int32), grid, self.store.classes)
+        # One copy; `jnp.array` would make two.
+        log_odds = jax.device_put(values, may_alias=False)
+        return VoxelMap(log_odds, to_device(frames_fused, np.int32), grid, self.store.classes)
 
 
 def tiles_of(grid: GridSpec, box: Int[np.ndarray, "2 3"]) -> Iterator[Tile]:
