@@ -37,11 +37,6 @@ def write_geotiff(
     Raises:
         JaxmapError: an unknown `crs`, or the disk is full or refuses.
     """
-    from rasterio import Affine
-    from rasterio.crs import CRS
-    from rasterio.errors import CRSError, NotGeoreferencedWarning
-    from rasterio.io import MemoryFile
-
     site_origin, layers = np.asarray(site_origin, np.float64), layers or {}
     label, observed = np.asarray(top.label), np.asarray(top.observed)
     named = {
@@ -51,6 +46,29 @@ def write_geotiff(
     for name, probability in zip(classes, np.asarray(top.probability), strict=True):
         named[f"probability_{name}"] = np.where(observed, probability, np.nan)
     named |= layers
+    write_bands(path, named, grid, crs, site_origin, classes=json.dumps(list(classes)))
+
+
+def write_bands(
+    path: str | os.PathLike[str],
+    named: Mapping[str, Float[np.ndarray, "X Y"]],
+    grid: GridSpec,
+    crs: str | None,
+    site_origin: np.ndarray,
+    **tags: str,
+) -> None:
+    """Writes layers of the columns of a grid as the bands of a north-up raster, float32, NaN where nothing is known.
+
+    Bands are named by their descriptions; a name that ends in `_m` or `_deg` says the unit.
+
+    Raises:
+        JaxmapError: an unknown `crs`, or the disk is full or refuses.
+    """
+    from rasterio import Affine
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError, NotGeoreferencedWarning
+    from rasterio.io import MemoryFile
+
     # From x east, y north to rows from the north and columns to the east.
     bands = np.stack([band.T[::-1] for band in named.values()]).astype(np.float32)
     count, height, width = bands.shape
@@ -72,8 +90,10 @@ def write_geotiff(
         with memory.open(**profile) as raster:
             raster.write(bands)
             raster.descriptions = tuple(named)
-            raster.units = tuple("m" if name == "height_m" else "" for name in named)
-            raster.update_tags(classes=json.dumps(list(classes)))
+            raster.units = tuple(
+                next((unit for unit in ("m", "deg") if name.endswith(f"_{unit}")), "") for name in named
+            )
+            raster.update_tags(**tags)
         content = bytes(memory.getbuffer())
     # Encoded in memory: Python reports a full disk, where GDAL may find out only while closing.
     with atomic_path(path) as temporary:

@@ -21,6 +21,7 @@ from jaxmap.fusion.integrate import add_evidence, count_points
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
+from jaxmap.fusion.surface import add_heights, height_sigma, sum_heights
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
@@ -116,6 +117,11 @@ def fuse_frame(
         assert params.ensemble is not None
         own = fuse_members(voxel_map, frame, labels, camera, params.ensemble, frame_key, rule, depth_range_m, shape)
         fused = replace(fused, members=own)
+
+    if fused.surface is not None:
+        sigma_m = height_sigma(cloud, pose.translation()[2])
+        heights = sum_heights(grid, cloud.points_world, sigma_m, labels.keep, window)
+        fused = replace(fused, surface=add_heights(fused.surface, heights, window))
 
     hits = total_weight(counts) > 0
     report = StepReport(
@@ -230,7 +236,7 @@ def make_mapper(
     # Only the tensors are donated: the small arrays of the grid may be shared with other maps.
     compiled: Any = jax.jit(fuse_donated, donate_argnums=0)
     return Mapper(
-        init=lambda: make_voxel_map(grid, labeller.classes, members),
+        init=lambda: make_voxel_map(grid, labeller.classes, members, surface=rule.surface),
         step=lambda voxel_map, *inputs: compiled(*_apart(voxel_map), *inputs),
         fuse=fuse,
         scan=jax.jit(scan),
@@ -290,8 +296,10 @@ class _Tensors(NamedTuple):
 
     log_odds: Array
     members: Array | None
+    surface: Array | None
 
 
 def _apart(voxel_map: VoxelMap) -> tuple[_Tensors, VoxelMap]:
     """The tensors of a map, and the map without them."""
-    return _Tensors(voxel_map.log_odds, voxel_map.members), replace(voxel_map, log_odds=None, members=None)
+    tensors = _Tensors(voxel_map.log_odds, voxel_map.members, voxel_map.surface)
+    return tensors, replace(voxel_map, **dict.fromkeys(_Tensors._fields))
