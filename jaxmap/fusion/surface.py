@@ -80,8 +80,8 @@ def add_heights(surface: Float[Array, "4 X Y"], added: Float[Array, "4 x y"], wi
     return jax.lax.dynamic_update_slice(surface, here + added, corner)
 
 
-@partial(jax.jit, static_argnames="most_sigma_m")
-def read_surface(voxel_map: VoxelMap, params: FusionParams, most_sigma_m: float = 0.05) -> Surface:
+@partial(jax.jit, static_argnames=("most_sigma_m", "reach"))
+def read_surface(voxel_map: VoxelMap, params: FusionParams, most_sigma_m: float = 0.05, reach: int = 0) -> Surface:
     """The heights of a map's columns.
 
     The height is the mean of the points, each weighted by the inverse of its variance. Its variance is that of the
@@ -97,6 +97,9 @@ def read_surface(voxel_map: VoxelMap, params: FusionParams, most_sigma_m: float 
         voxel_map: the map.
         params: how it is read.
         most_sigma_m: heights of greater sigma are not known.
+        reach: columns to either side whose points count, too, where those of the column are not enough: the fewest that
+            are. Far ground, of which each column holds a few pixels, is known so, less sharply; errors that neighbours
+            share are not in its sigma.
     """
     solid, grid = occupied(voxel_map, params), voxel_map.grid
     seen, size_m, floor_m = solid.any(axis=-1), grid.voxel_size_m[2], grid.origin_m[2]
@@ -105,12 +108,26 @@ def read_surface(voxel_map: VoxelMap, params: FusionParams, most_sigma_m: float 
     if voxel_map.surface is None:
         sigma = jnp.full(seen.shape, 1.0) * size_m / jnp.sqrt(12.0)
         return Surface(floor_m + (highest + 0.5) * size_m, sigma, seen)
-    count, weight, first, second = voxel_map.surface
-    above_m = first / jnp.maximum(weight, 1e-12)
-    scatter = jnp.maximum(second / jnp.maximum(weight, 1e-12) - above_m**2, 0.0)
-    expected = count / jnp.maximum(weight, 1e-12)
-    variance = POSE_SIGMA_M**2 + jnp.maximum(scatter, expected) * _SHARED_PIXELS / jnp.maximum(count, 1.0)
     lowest = jnp.where(solid, level, grid.shape[2]).min(axis=-1)
-    inside = (above_m > (lowest - 1) * size_m) & (above_m < (highest + 2) * size_m)
-    known = seen & inside & (count >= _FEWEST_POINTS) & (variance < most_sigma_m**2)
+    above_m, variance, known = jnp.zeros(seen.shape), jnp.zeros(seen.shape), jnp.zeros(seen.shape, bool)
+    for width in range(reach + 1):
+        mean_m, wider, count = _mean_heights(_box_sums(voxel_map.surface, width))
+        inside = (mean_m > (lowest - 1) * size_m) & (mean_m < (highest + 2) * size_m)
+        more = ~known & seen & inside & (count >= _FEWEST_POINTS) & (wider < most_sigma_m**2)
+        above_m, variance, known = jnp.where(more, mean_m, above_m), jnp.where(more, wider, variance), known | more
     return Surface(floor_m + above_m, jnp.sqrt(variance), known)
+
+
+def _mean_heights(sums: Float[Array, "4 X Y"]) -> tuple[Array, Array, Array]:
+    """Mean height above the floor of the grid, its variance, and the number of points."""
+    count, weight, first, second = sums
+    weight = jnp.maximum(weight, 1e-12)
+    mean_m = first / weight
+    scatter = jnp.maximum(second / weight - mean_m**2, 0.0)
+    variance = POSE_SIGMA_M**2 + jnp.maximum(scatter, count / weight) * _SHARED_PIXELS / jnp.maximum(count, 1.0)
+    return mean_m, variance, count
+
+
+def _box_sums(sums: Float[Array, "4 X Y"], reach: int) -> Float[Array, "4 X Y"]:
+    size = (1, 2 * reach + 1, 2 * reach + 1)
+    return jax.lax.reduce_window(sums, 0.0, jax.lax.add, size, (1, 1, 1), "SAME") if reach else sums

@@ -1,8 +1,8 @@
 """What a metre of driving is expected to cost, from hazards, the probability of rock, and ground that was not seen.
 
 GESTALT gives each cell the goodness of its worst hazard, falling linearly from 1 to 0 at what the rover cannot drive
-(Goldberg, Maimone and Matthies 2002). Here a metre of goodness g costs 1 / g metres; what may be there adds its cost times its
-probability, the expected cost (Berger 1985, "Statistical decision theory and Bayesian analysis"). All is
+(Goldberg, Maimone and Matthies 2002). Here a metre of goodness g costs 1 / g metres; what may be there adds its cost
+times its probability, the expected cost (Berger 1985, "Statistical decision theory and Bayesian analysis"). All is
 differentiable almost everywhere, so that a map can be tuned by what its errors cost.
 """
 
@@ -48,14 +48,14 @@ def cost_map(
     cell_m: tuple[float, float],
     rover: RoverOptions,
 ) -> CostMap:
-    """The expected cost of driving a metre at each cell:
+    """The expected cost of driving a metre at each cell.
 
         cost = 1 / goodness + rock_cost * rock + unknown_cost * unknown,
         goodness = min over hazards of clip((max - value) / (max - free * max), 0, 1),
 
     where `rock` is the greatest, under the rover, of the mean probabilities over the least rock worth a detour.
-    The rover stays away from where goodness is 0 within its margin, where more than `max_unknown` was not seen, and from
-    the edge of the map.
+    The rover stays away from where goodness is 0 within its margin, where more than `max_unknown` was not seen, and
+    from the edge of the map.
 
     Args:
         hazards: of the ground, measured over the rover's disc.

@@ -19,6 +19,9 @@ from jaxmap.planning.hazards import Hazards, Heights, measure_hazards
 from jaxmap.planning.options import RoverOptions
 from jaxmap.types import GridSpec, VoxelMap
 
+_REACH_M = 0.1
+"""Columns so far around lend their points to far ground, of which there are few."""
+
 SURFACE_LAYER, SIGMA_LAYER = "surface_m", "surface_sigma_m"
 """Names of a map's layers: height of the surface (world z) and its standard deviation; NaN where it is not known."""
 
@@ -50,7 +53,8 @@ def read_ground(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule, roc
     probability = np.zeros(top.observed.shape, np.float32)
     if rock is not None:
         probability = np.asarray(top.probability[voxel_map.classes.index(rock)])
-    return Ground(read_surface(voxel_map, params), probability, np.asarray(top.observed))
+    reach = round(_REACH_M / min(cell_size(voxel_map.grid)))
+    return Ground(read_surface(voxel_map, params, reach=reach), probability, np.asarray(top.observed))
 
 
 def cell_size(grid: GridSpec) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,7 +103,7 @@ def sampled(points_m: Float[np.ndarray, "M 2"], step_m: float) -> Float[np.ndarr
     """Places along a path, its corners among them, no farther apart than a step."""
     pieces = [
         np.linspace(start, end, max(1, int(np.ceil(np.linalg.norm(end - start) / step_m))), endpoint=False)
-        for start, end in zip(points_m[:-1], points_m[1:], strict=True)
+        for start, end in itertools.pairwise(points_m)
     ]
     return np.concatenate([*pieces, points_m[-1:]])
 

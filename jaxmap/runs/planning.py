@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 import jaxmap
@@ -237,16 +237,18 @@ def _metrics(
 
 
 def clearance(costs: Costs) -> Float[np.ndarray, "X Y"]:
-    """How far a rover over each cell is from rock and from what it cannot drive, metres; infinite where there is none."""
+    """Metres from a rover over each cell to rock and to what it cannot drive; infinite where there is none."""
     rock = costs.ground.seen & (costs.ground.rock_probability > ROCK)
     # Hazards are those of the whole disc: its centre is where they begin.
     barred = np.isfinite(costs.hazards.slope_deg) & (costs.costs.goodness <= 0)
-    far = np.full(rock.shape, np.inf)
-    to_rock, to_hazard = (
-        distance_transform_edt(~where, sampling=costs.terrain.cell_m) if where.any() else far
-        for where in (rock, barred)
-    )
+    to_rock, to_hazard = (_distance_m(where, costs.terrain.cell_m) for where in (rock, barred))
     return np.minimum(to_rock - costs.rover.radius_m, to_hazard)
+
+
+def _distance_m(where: Bool[np.ndarray, "X Y"], cell_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "X Y"]:
+    if not where.any():
+        return np.full(where.shape, np.inf)
+    return np.asarray(distance_transform_edt(~where, sampling=tuple(cell_m)))
 
 
 def _text(place: Float[np.ndarray, "2"]) -> str:
