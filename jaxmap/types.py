@@ -24,6 +24,9 @@ from jaxmap.errors import JaxmapError
 MAX_TENSOR_ELEMENTS = 2**31 - 1
 """Flat indices are int32, so a map tensor holds at most this many numbers."""
 
+MOST_VOXELS_ALONG = 2**23
+"""Indices of voxels along an axis, and halves of them, are exact in float32 up to here: 419 km of 0.05 m."""
+
 MOST_CAMERA_PX, MOST_BASELINE_M = 1e6, 1e4
 """Focal lengths and principal points, and baselines, beyond these are mistakes; float32 must hold their products."""
 _LEAST = 1e-6
@@ -138,15 +141,37 @@ class Frame:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class GridSpec:
-    """A bounded voxel grid: voxel `i` spans `[origin_m + i * size, origin_m + (i + 1) * size)`."""
+    """A box of voxels on an endless lattice.
 
-    origin_m: Float[Array, "3"]
+    Voxel `i` of the lattice spans `[lattice_m + i * size, lattice_m + (i + 1) * size)`; the box begins at voxel
+    `first`. Where a point lies on the lattice does not depend on the box, to the last bit: a map may be cut into boxes
+    in any way.
+    """
+
+    lattice_m: Float[Array, "3"]
     voxel_size_m: Float[Array, "3"]
     shape: tuple[int, int, int] = field(metadata=_static())
+    first: Int[Array, "3"] = field(default_factory=lambda: np.zeros(3, np.int32))  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def origin_m(self) -> Float[Array, "3"]:
+        """The lower corner of the box, world."""
+        return self.lattice_m + self.first * self.voxel_size_m
 
 
-def make_grid(lower_m: Sequence[float], upper_m: Sequence[float], voxel_size_m: float | Sequence[float]) -> GridSpec:
-    """The grid that spans from `lower_m` to at least `upper_m` (world, metres).
+def make_grid(
+    lower_m: Sequence[float],
+    upper_m: Sequence[float],
+    voxel_size_m: float | Sequence[float],
+    lattice_m: Float[np.ndarray, "3"] | None = None,
+) -> GridSpec:
+    """The grid that spans from `lower_m`, or a little below it, to at least `upper_m` (world, metres).
+
+    Args:
+        lower_m: lower corner.
+        upper_m: upper corner.
+        voxel_size_m: edge of a voxel, or three edges.
+        lattice_m: float64, where a voxel of the lattice begins; without it the lattice begins at `lower_m`.
 
     Raises:
         JaxmapError: bounds not finite or not ordered, or a voxel size that is not positive.
@@ -166,14 +191,22 @@ def make_grid(lower_m: Sequence[float], upper_m: Sequence[float], voxel_size_m: 
         )
     if not (np.isfinite(size).all() and (size > 0).all()):
         raise JaxmapError(f"voxel size {size.tolist()} m", where="grid", fix="give a positive size")
+    lattice = lower if lattice_m is None else np.asarray(lattice_m, np.float64)
     # A span of 40 m in voxels of 0.2 m is 200 voxels, not 201, in spite of rounding.
-    counts = np.ceil((upper - lower) / size - 1e-6).clip(min=1)
-    if counts.max() > MAX_TENSOR_ELEMENTS:
-        raise JaxmapError(f"{counts.max():.3g} voxels along one axis", where="grid", fix="take larger voxels")
+    first = np.floor((lower - lattice) / size + 1e-6)
+    counts = (np.ceil((upper - lattice) / size - 1e-6) - first).clip(min=1)
+    farthest = max(np.abs(first).max(), np.abs(first + counts).max())
+    if farthest > MOST_VOXELS_ALONG:
+        raise JaxmapError(
+            f"{farthest:.3g} voxels along one axis, at most {MOST_VOXELS_ALONG:,} can be told apart",
+            where="grid",
+            fix="take larger voxels",
+        )
     return GridSpec(
-        origin_m=to_device(lower, np.float32),
+        lattice_m=to_device(lattice, np.float32),
         voxel_size_m=to_device(size, np.float32),
         shape=(int(counts[0]), int(counts[1]), int(counts[2])),
+        first=to_device(first, np.int32),
     )
 
 

@@ -29,12 +29,11 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(ExportArguments, "export", words)
 
-    from jaxmap.mapping.store import load_map
+    from jaxmap.mapping.store import open_map
     from jaxmap.runs.folder import EXPORTS, RunFolder, write_exports
 
     folder = RunFolder(arguments.run)
     folder.settle_for_reading()
-    voxel_map, attributes = load_map(folder.map)
     formats = tuple(EXPORTS) if arguments.format == "all" else (arguments.format,)
-    Console().result(arguments.run, write_exports(folder, voxel_map, attributes, formats))
+    Console().result(arguments.run, write_exports(folder, open_map(folder.map), formats))
     return 0

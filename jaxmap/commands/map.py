@@ -68,7 +68,7 @@ def main(words: Sequence[str]) -> int:
     console = Console()
     folder = RunFolder(arguments.out)
     with console.counted("odometry", "frames") as on_frame:
-        plan = plan_run(arguments.sequence, config, console.notify, on_frame)
+        plan = plan_run(arguments.sequence, config, console.notify, on_frame, in_tiles=True)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite
     with (

@@ -75,11 +75,11 @@ def fuse_members(
         window = view_window(grid, camera, pose, depth_range_m[1], window_shape)
         free = None
         if rule.carve:
-            free = carve(camera, pose, cloud.depth_m, cloud.valid, grid, fusion, depth_range_m, window)
+            free = carve(camera, pose, cloud.depth_m, cloud.valid, window, fusion, depth_range_m)
         weights = point_weights(grid, cloud, rule)
-        counts = count_points(grid, cloud.points_world, own, weights, len(voxel_map.classes), window)
+        counts = count_points(window, cloud.points_world, own, weights, len(voxel_map.classes))
         evidence = frame_evidence(counts, free, fusion, rule)
-        return jnp.stack([evidence[0], evidence[index_of_class]]), window.start
+        return jnp.stack([evidence[0], evidence[index_of_class]]), window.first - grid.first
 
     def fuse_some(index: Int[Array, ""], members: Array) -> Array:
         some: Any = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, index * at_once, at_once), drawn)

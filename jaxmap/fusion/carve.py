@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmap.fusion.params import FusionParams
 from jaxmap.geometry.camera import depth_sigma, points_to_pixels, transform_points
-from jaxmap.geometry.grid import Window, voxel_centres
+from jaxmap.geometry.grid import voxel_centres
 from jaxmap.types import GridSpec, StereoCamera
 
 _MARGIN_SIGMAS = 2.0
@@ -23,7 +23,6 @@ def carve(
     grid: GridSpec,
     params: FusionParams,
     depth_range_m: tuple[float, float] = (0.0, float("inf")),
-    window: Window | None = None,
 ) -> Bool[Array, "X Y Z"]:
     """Which voxels the camera saw through.
 
@@ -38,11 +37,10 @@ def carve(
         grid: whose voxels are asked about.
         params: `disparity_sigma_px` sets the depth noise.
         depth_range_m: nearer and farther voxels are left alone.
-        window: the part of the grid that is asked about; all of it if not given.
     """
 
     def look_up() -> Bool[Array, "X Y Z"]:
-        centres_camera = transform_points(T_world_camera.inverse(), voxel_centres(grid, window))
+        centres_camera = transform_points(T_world_camera.inverse(), voxel_centres(grid))
         u_px, v_px, _, in_front = points_to_pixels(camera, centres_camera)
         height, width = depth_m.shape
         column, row = jnp.round(u_px), jnp.round(v_px)
@@ -58,7 +56,6 @@ def carve(
         return in_view & seen_through & in_range
 
     with jax.named_scope("carve"):
-        shape = grid.shape if window is None else window.grid.shape
         # Nothing is fused across a conditional: as a part of what reads it, carving would be computed anew for each
         # of its readers.
-        return jax.lax.cond(valid.any(), look_up, lambda: jnp.zeros(shape, bool))
+        return jax.lax.cond(valid.any(), look_up, lambda: jnp.zeros(grid.shape, bool))

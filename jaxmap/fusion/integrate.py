@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, total_weight
-from jaxmap.geometry.grid import Window, flat_voxel_index, whole_window
+from jaxmap.geometry.grid import flat_voxel_index
 from jaxmap.types import GridSpec, PointLabels, VoxelMap
 
 
@@ -23,7 +23,7 @@ def integrate(
     weights: Float[Array, "N"],
     params: FusionParams,
     rule: FusionRule,
-    window: Window | None = None,
+    window: GridSpec | None = None,
     free: Bool[Array, "X Y Z"] | None = None,
 ) -> tuple[VoxelMap, Float[Array, "X Y Z"]]:
     """Adds one frame to the map.
@@ -45,16 +45,15 @@ def integrate(
     Returns:
         The new map, and the weight of the points in each voxel of the window.
     """
-    if window is None:
-        window = whole_window(voxel_map.grid)
-    counts = count_points(voxel_map.grid, points_world, labels, weights, len(voxel_map.classes), window)
+    window = voxel_map.grid if window is None else window
+    counts = count_points(window, points_world, labels, weights, len(voxel_map.classes))
     return add_evidence(voxel_map, frame_evidence(counts, free, params, rule), window), total_weight(counts)
 
 
-def add_evidence(voxel_map: VoxelMap, evidence: Float[Array, "C1 X Y Z"], window: Window) -> VoxelMap:
+def add_evidence(voxel_map: VoxelMap, evidence: Float[Array, "C1 X Y Z"], window: GridSpec) -> VoxelMap:
     """Adds what a frame says of the voxels of a window to the map, and counts the frame."""
     with jax.named_scope("add_evidence"):
-        corner = (jnp.zeros((), jnp.int32), *window.start)
+        corner = (jnp.zeros((), jnp.int32), *(window.first - voxel_map.grid.first))
         here = jax.lax.dynamic_slice(voxel_map.log_odds, corner, evidence.shape)
         log_odds = jax.lax.dynamic_update_slice(voxel_map.log_odds, here + evidence, corner)
     return replace(voxel_map, log_odds=log_odds, frames_fused=voxel_map.frames_fused + 1)
@@ -66,7 +65,6 @@ def count_points(
     labels: PointLabels,
     weights: Float[Array, "N"],
     class_count: int,
-    window: Window | None = None,
 ) -> Float[Array, "C1 X Y Z"]:
     """Weighted number of points per label and voxel, by scatter-add.
 
@@ -78,9 +76,8 @@ def count_points(
         keep = labels.keep & jnp.isfinite(weights)
         if labels.probabilities is not None:
             keep &= jnp.isfinite(labels.probabilities).all(axis=-1)
-        voxel = flat_voxel_index(grid, points_world, keep, window)
-        shape = grid.shape if window is None else window.grid.shape
-        rows, voxels = class_count + 1, int(np.prod(shape))
+        voxel = flat_voxel_index(grid, points_world, keep)
+        rows, voxels = class_count + 1, int(np.prod(grid.shape))
         counts = jnp.zeros((rows, voxels), weights.dtype)
         if labels.probabilities is not None:
             # Unrolled over channels: one flat scatter each is thrice as fast as scattering rows.
@@ -94,4 +91,4 @@ def count_points(
             row = jnp.where((label >= 0) & (label < class_count), label, class_count)
             index = jnp.where(voxel < voxels, row * voxels + voxel, rows * voxels)
             counts = counts.reshape(-1).at[index].add(weights, mode="drop")
-        return counts.reshape(rows, *shape)
+        return counts.reshape(rows, *grid.shape)

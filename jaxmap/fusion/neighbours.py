@@ -11,6 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+def kernel_margin(kernel: Float[Array, "C K K"] | None) -> int:
+    """How many columns around a part of a map decide with it."""
+    return 0 if kernel is None else kernel.shape[1] // 2
+
+
 def spread_evidence(evidence: Float[Array, "C X Y *z"], kernel: Float[Array, "C K K"]) -> Float[Array, "C X Y *z"]:
     """Each class's evidence, correlated with its kernel along x and y; there is none beyond the edges.
 

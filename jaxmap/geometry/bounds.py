@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.camera import depth_at_sigma, frustum_corners
@@ -22,6 +23,7 @@ def grid_around_views(
     max_depth_m: float,
     voxel_size_m: float | tuple[float, float, float],
     below_above_camera_m: tuple[float, float],
+    lattice_m: Float[np.ndarray, "3"] | None = None,
 ) -> GridSpec:
     """The smallest grid, aligned to whole voxels, that holds what the cameras can see.
 
@@ -32,6 +34,7 @@ def grid_around_views(
         voxel_size_m: edges of a voxel.
         below_above_camera_m: the grid reaches so far below the lowest camera, and so far above the
             highest one.
+        lattice_m: of the site (`site_lattice`), by default at the world's origin.
     """
     corners_camera = np.asarray(frustum_corners(camera, max_depth_m), np.float64)
     R, t = T_world_camera[:, :3, :3], T_world_camera[:, :3, 3]
@@ -39,9 +42,35 @@ def grid_around_views(
     lower, upper = corners_world.min(axis=(0, 1)), corners_world.max(axis=(0, 1))
     lower[2] = max(lower[2], t[:, 2].min() - below_above_camera_m[0])
     upper[2] = min(upper[2], t[:, 2].max() + below_above_camera_m[1])
-    size = np.broadcast_to(np.asarray(voxel_size_m, np.float64), (3,))
-    # On whole multiples of the voxel, so that runs over the same site share their cells.
-    return make_grid((np.floor(lower / size) * size).tolist(), (np.ceil(upper / size) * size).tolist(), size.tolist())
+    return make_grid(lower.tolist(), upper.tolist(), voxel_size_m, np.zeros(3) if lattice_m is None else lattice_m)
+
+
+def site_lattice(
+    site_origin: Float[np.ndarray, "3"], voxel_size_m: float | tuple[float, float, float]
+) -> Float[np.ndarray, "3"]:
+    """Where the lattice of a site lies relative to its origin: on whole voxels of the coordinate reference system.
+
+    So the maps of any sessions in one system share their voxels, wherever each has its origin. Float64, metres.
+    """
+    size_m = np.broadcast_to(np.asarray(voxel_size_m, np.float64), (3,))
+    # Rounded to what metres of millions are good for in float64: no remainder but a true one.
+    return np.round(np.round(site_origin / size_m) * size_m - site_origin, 7) + 0.0
+
+
+def view_boxes(
+    grid: GridSpec, camera: StereoCamera, T_world_camera: Float[np.ndarray, "N 4 4"], max_depth_m: float
+) -> Int[np.ndarray, "N 2 3"]:
+    """The voxels that views can touch, on the lattice: the first along each axis, and one past the last.
+
+    A voxel more on each side makes up for rounding in the step. Where a view lies outside the grid its box is empty.
+    Host side, float64.
+    """
+    corners_camera = np.asarray(frustum_corners(camera, max_depth_m), np.float64)
+    corners = np.einsum("nij,kj->nki", T_world_camera[:, :3, :3], corners_camera) + T_world_camera[:, None, :3, 3]
+    scaled = (corners - np.asarray(grid.lattice_m, np.float64)) / np.asarray(grid.voxel_size_m, np.float64)
+    lower, upper = np.asarray(grid.first), np.asarray(grid.first) + grid.shape
+    first = np.clip(np.floor(scaled.min(axis=1)) - 1, lower, upper)
+    return np.stack([first, np.clip(np.floor(scaled.max(axis=1)) + 2, first, upper)], axis=1).astype(np.int64)
 
 
 def map_bytes(grid: GridSpec, class_count: int, members: int = 0) -> int:

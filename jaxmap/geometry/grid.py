@@ -1,9 +1,8 @@
-"""Where points lie in a voxel grid, and windows of a grid that a camera can see."""
+"""Where points lie in a voxel grid, and the part of a grid that a camera can see."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +15,13 @@ from jaxmap.types import GridSpec, StereoCamera
 
 
 def world_to_voxel(grid: GridSpec, points_world: Float[Array, "*s 3"]) -> tuple[Int[Array, "*s 3"], Bool[Array, "*s"]]:
-    """Voxel indices of points, `floor((p - origin) / size)`.
+    """Voxel indices of points in the grid, `floor((p - lattice) / size) - first`.
 
     Returns:
         index: int32; 0 where not inside.
         inside: the point is finite and in the grid.
     """
-    scaled = jnp.floor((points_world - grid.origin_m) / grid.voxel_size_m)
+    scaled = jnp.floor((points_world - grid.lattice_m) / grid.voxel_size_m) - grid.first
     # Tested on floats: a NaN or a huge number cast to int32 would be a valid index.
     inside = jnp.all((scaled >= 0) & (scaled < jnp.array(grid.shape, jnp.float32)), axis=-1)
     return jnp.where(inside[..., None], scaled, 0.0).astype(jnp.int32), inside
@@ -33,55 +32,38 @@ def exact_corner(grid: GridSpec) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
 
     Georeferences are read by people, and cells of 0.2 m must hold voxels of 0.05 m exactly.
     """
-    origin_m, size_m = (
+    lattice_m, size_m = (
         np.array([float(str(number)) for number in np.asarray(numbers, np.float32)])
-        for numbers in (grid.origin_m, grid.voxel_size_m)
+        for numbers in (grid.lattice_m, grid.voxel_size_m)
     )
-    return origin_m, size_m
+    return np.round(lattice_m + np.asarray(grid.first) * size_m, 9), size_m
 
 
-class Window(NamedTuple):
-    """A part of a grid: the index of its first voxel, and the part as a grid of its own."""
-
-    start: Int[Array, "3"]
-    grid: GridSpec
-
-
-def flat_voxel_index(
-    grid: GridSpec, points_world: Float[Array, "*s 3"], keep: Bool[Array, "*s"], window: Window | None = None
-) -> Int[Array, "*s"]:
-    """Flat (row-major) voxel indices in the window; points outside or not kept get its number of voxels.
+def flat_voxel_index(grid: GridSpec, points_world: Float[Array, "*s 3"], keep: Bool[Array, "*s"]) -> Int[Array, "*s"]:
+    """Flat (row-major) voxel indices in the grid; points outside or not kept get its number of voxels.
 
     That number is one past the end: a scatter with `mode="drop"` leaves them out exactly, where -1
     would wrap round to the last voxel.
     """
-    start, shape = (jnp.zeros(3), grid.shape) if window is None else (window.start, window.grid.shape)
     flat, inside = jnp.zeros((), jnp.int32), keep
     # Axis by axis, because XLA does not vectorise over a last axis of three.
     for axis in range(3):
-        scaled = jnp.floor((points_world[..., axis] - grid.origin_m[axis]) / grid.voxel_size_m[axis])
-        # Found in the whole grid and then moved: a point on a face falls into one voxel, whatever the window.
-        scaled = scaled - start[axis]
+        scaled = jnp.floor((points_world[..., axis] - grid.lattice_m[axis]) / grid.voxel_size_m[axis])
+        # Found on the lattice and then moved: a point on a face falls into one voxel, whatever the grid.
+        scaled = scaled - grid.first[axis]
         # Tested on floats: a NaN or a huge number cast to int32 would be a valid index.
-        inside = inside & (scaled >= 0) & (scaled < shape[axis])
-        flat = flat * shape[axis] + scaled.astype(jnp.int32)
-    return jnp.where(inside, flat, int(np.prod(shape)))
+        inside = inside & (scaled >= 0) & (scaled < grid.shape[axis])
+        flat = flat * grid.shape[axis] + scaled.astype(jnp.int32)
+    return jnp.where(inside, flat, int(np.prod(grid.shape)))
 
 
-def voxel_centres(grid: GridSpec, window: Window | None = None) -> Float[Array, "X Y Z 3"]:
-    """World positions of the voxel centres of a window, in metres; of the whole grid without one."""
-    window = whole_window(grid) if window is None else window
-    # Counted from the origin of the whole grid: a voxel's centre is the same number through any window.
+def voxel_centres(grid: GridSpec) -> Float[Array, "X Y Z 3"]:
+    """World positions of the voxel centres, in metres."""
+    # Counted along the lattice: a voxel's centre is the same number in any grid.
     axes = [
-        grid.origin_m[i] + (window.start[i] + jnp.arange(window.grid.shape[i]) + 0.5) * grid.voxel_size_m[i]
-        for i in range(3)
+        grid.lattice_m[i] + (grid.first[i] + jnp.arange(grid.shape[i]) + 0.5) * grid.voxel_size_m[i] for i in range(3)
     ]
     return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1)
-
-
-def whole_window(grid: GridSpec) -> Window:
-    """The window that is the whole grid."""
-    return Window(jnp.zeros(3, jnp.int32), grid)
 
 
 def window_shape(
@@ -113,12 +95,11 @@ def view_window(
     T_world_camera: jaxlie.SE3,
     max_depth_m: Float[Array, ""] | float,
     shape: tuple[int, int, int],
-) -> Window:
-    """The window of the grid, of a static `shape`, that holds all that the camera can see."""
+) -> GridSpec:
+    """The window of the grid, of a static `shape`, that holds all that the camera can see of it."""
     with jax.named_scope("view_window"):
         corners = transform_points(T_world_camera, frustum_corners(camera, max_depth_m))
-        first = jnp.floor((corners.min(axis=0) - grid.origin_m) / grid.voxel_size_m)
-        last_start = jnp.array(grid.shape, jnp.float32) - jnp.array(shape, jnp.float32)
+        first = jnp.floor((corners.min(axis=0) - grid.lattice_m) / grid.voxel_size_m)
+        last = grid.first + jnp.array(grid.shape, jnp.float32) - jnp.array(shape, jnp.float32)
         # Clipped as floats: far outside the grid the cast would wrap round.
-        start = jnp.clip(first, 0.0, last_start).astype(jnp.int32)
-        return Window(start, replace(grid, origin_m=grid.origin_m + start * grid.voxel_size_m, shape=shape))
+        return replace(grid, first=jnp.clip(first, grid.first, last).astype(jnp.int32), shape=shape)

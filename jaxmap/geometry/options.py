@@ -22,9 +22,10 @@ class GridOptions:
 
     voxel_size_m: Edge | tuple[Edge, Edge, Edge] | None = None
     """Edge of a voxel, or three edges (x, y, z). By default 0.05 0.05 0.2: columns finer than the cells that maps are
-    scored in, so that rocks are measured by area; or the next of 0.1 0.1 0.2 and 0.2 whose map fits the memory."""
+    scored in, so that rocks are measured by area."""
     lower_m: Triple | None = None
-    """Lower corner of the map, relative to the site origin; by default the poses and the range decide."""
+    """Lower corner of the map, relative to the site origin, down to whole voxels; by default the poses and the range
+    decide."""
     upper_m: Triple | None = None
     """Upper corner, with the lower one."""
     below_camera_m: Annotated[float, Positive] = 3.0
@@ -32,7 +33,7 @@ class GridOptions:
     above_camera_m: Annotated[float, Positive] = 2.0
     """How far automatic bounds reach above the highest camera."""
     max_memory_gib: Annotated[float, Interval(ge=1e-6, le=LARGEST)] = 2.0
-    """Larger maps are refused."""
+    """Of a map that takes more, only tiles near the rover are in memory, and the others on disk."""
 
 
 @options("depth")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -149,6 +149,7 @@ def run_sequence(
     *,
     strict: bool = False,
     form: Frame | None = None,
+    cover: Callable[[VoxelMap, int], VoxelMap] = lambda voxel_map, index: voxel_map,
 ) -> Iterator[tuple[VoxelMap, FusedFrame]]:
     """Fuses prepared frames one after the other.
 
@@ -161,6 +162,7 @@ def run_sequence(
         strict: stop at a frame that cannot be used.
         form: that of the frames (`frame_form`): the step is compiled for it while the first ones are read. Without it,
             the first frame that is ready compiles the step.
+        cover: of a map that is a part of a larger one: moves it so that it holds the view of a frame, given its index.
 
     Yields:
         After each frame, the map so far and what became of the frame. The map is donated to the
@@ -183,6 +185,7 @@ def run_sequence(
             mapper, cost = compile_step(mapper, voxel_map, prepared.frame, params, key)
             news = cost
         with timed_stage("step", prepared.stages_s):
+            voxel_map = cover(voxel_map, prepared.index)
             voxel_map, info = mapper.step(voxel_map, prepared.frame, params, key)
             jax.block_until_ready(voxel_map.log_odds)
         yield voxel_map, FusedFrame(prepared, info, news)

@@ -109,9 +109,9 @@ def fuse_frame(
     window = view_window(grid, camera, pose, depth_range_m[1], shape)
     free = None
     if rule.carve:
-        free = carve(camera, pose, cloud.depth_m, cloud.valid, grid, fusion, depth_range_m, window)
+        free = carve(camera, pose, cloud.depth_m, cloud.valid, window, fusion, depth_range_m)
     weights = point_weights(grid, cloud, rule)
-    counts = count_points(grid, cloud.points_world, labels, weights, len(voxel_map.classes), window)
+    counts = count_points(window, cloud.points_world, labels, weights, len(voxel_map.classes))
     fused = add_evidence(voxel_map, frame_evidence(counts, free, fusion, rule), window)
     if members:
         assert params.ensemble is not None

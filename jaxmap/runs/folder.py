@@ -19,6 +19,7 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.export.geotiff import write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
+from jaxmap.fusion.neighbours import kernel_margin
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
@@ -26,12 +27,10 @@ from jaxmap.host.bounded_text import read_text
 from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.host.replacement import Replacement
-from jaxmap.mapping.store import MapAttributes, holds_map, load_map, stray_maps
+from jaxmap.mapping.store import MapReader, holds_map, load_map, stray_maps
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
 from jaxmap.report.top_down import missed_picture, top_down_picture
-from jaxmap.runs.log import RunLog
 from jaxmap.stereo.front_end import RectifiedFrame
-from jaxmap.types import VoxelMap
 
 _PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.png")
 
@@ -147,17 +146,6 @@ class RunFolder:
         except JaxmapError:
             return False
 
-    def resume_point(self) -> tuple[VoxelMap, RunLog] | None:
-        """The map and log that an interrupted run has saved, or None where it has saved none.
-
-        Raises:
-            JaxmapError: there is a map, but it cannot be read.
-        """
-        if not holds_map(self.map):
-            return None
-        voxel_map, attributes = load_map(self.map, members=True)
-        return voxel_map, RunLog.from_json(attributes.progress, self.map)
-
     def _check_own(self) -> None:
         """Checks that the files to be replaced are a run's.
 
@@ -216,15 +204,14 @@ EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.p
 """The file that each form of a map goes into."""
 
 
-def write_exports(
-    folder: RunFolder, voxel_map: VoxelMap, attributes: MapAttributes, formats: Sequence[str] = tuple(EXPORTS)
-) -> list[str]:
+def write_exports(folder: RunFolder, reader: MapReader, formats: Sequence[str] = tuple(EXPORTS)) -> list[str]:
     """Writes the map in other forms, and returns the names of the files.
 
     The pictures show the path of poses.tum, where there is one. Of a map with an ensemble there is another picture,
     of what it may have missed.
     """
     written = [EXPORTS[name] for name in EXPORTS if name in formats]
+    voxel_map, attributes = load_map(folder.map)
     params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
     if "ply" in formats:
         write_ply(folder.ply, occupied_voxels(voxel_map, params, rule), voxel_map.classes, attributes.site_origin)
@@ -246,30 +233,30 @@ def write_exports(
     return written
 
 
-def count_voxels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule) -> dict[str, Any]:
+def count_voxels(reader: MapReader, params: FusionParams, rule: FusionRule) -> dict[str, Any]:
     """How many voxels were observed, are occupied or free, and have each class."""
-    seen, solid = observed(voxel_map), occupied(voxel_map, params)
-    labels = np.bincount(np.asarray(voxel_labels(voxel_map, params, rule)).ravel(), minlength=256)
-    return {
-        "observed": int(seen.sum()),
-        "occupied": int(solid.sum()),
-        "free": int((seen & ~solid).sum()),
-        "by_class": {name: int(labels[index]) for index, name in enumerate(voxel_map.classes)},
-    }
+    seen = solid = 0
+    by_class = np.zeros(256, np.int64)
+    for voxel_map, own, _ in reader.blocks(kernel_margin(params.class_kernel)):
+        seen += int(observed(voxel_map)[own].sum())
+        solid += int(occupied(voxel_map, params)[own].sum())
+        by_class += np.bincount(np.asarray(voxel_labels(voxel_map, params, rule))[own].ravel(), minlength=256)
+    named = {name: int(by_class[index]) for index, name in enumerate(reader.classes)}
+    return {"observed": seen, "occupied": solid, "free": seen - solid, "by_class": named}
 
 
-def count_missed(rule: FusionRule, attributes: MapAttributes, voxel_map: VoxelMap) -> dict[str, Any]:
+def count_missed(rule: FusionRule, reader: MapReader, members: int) -> dict[str, Any]:
     """What the ensemble expects the map to have missed; nothing where there is no ensemble."""
-    target = rule.target(voxel_map.classes)
-    layers = stored_layers(attributes.layers, target, "map")
-    if layers is None or voxel_map.members is None:
+    target = rule.target(reader.classes)
+    layers = stored_layers(reader.attributes.layers, target, "map")
+    if layers is None or not members:
         return {}
     missed = np.asarray(layers.missed, np.float64)
-    column_m2 = float(np.prod(np.asarray(voxel_map.grid.voxel_size_m, np.float64)[:2]))
+    column_m2 = float(np.prod(np.asarray(reader.grid.voxel_size_m, np.float64)[:2]))
     return {
         "ensemble": {
             "class": target,
-            "members": len(voxel_map.members),
+            "members": members,
             "missed_area_expected_m2": round(float(np.nansum(missed)) * column_m2, 4),
             "called_area_m2": round(int(layers.called().sum()) * column_m2, 4),
             "observed_area_m2": round(int(np.isfinite(missed).sum()) * column_m2, 4),

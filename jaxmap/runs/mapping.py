@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +14,13 @@ import jaxmap
 from jaxmap.ensemble.layer import named_layers
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.geometry_scores import DisparityScores, score_disparity
+from jaxmap.geometry.bounds import map_bytes, view_boxes
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
+from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
-from jaxmap.mapping.store import MapAttributes, save_map
+from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
+from jaxmap.mapping.tiles import MovingBlock, TileStore
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.checking import finding_line, findings_tree
@@ -60,7 +65,8 @@ def run_plan(
     Raises:
         JaxmapError: no frame could be fused, or an output cannot be written.
     """
-    voxel_map, log = _resumed(plan, folder) or (plan.mapper.init(), RunLog())
+    memory = _TiledMap(plan, folder.map) if plan.block_shape else _WholeMap(plan, folder.map)
+    voxel_map, log = memory.begin()
     if log.complete:
         notify("the run is complete already; its outputs are written anew")
     elif log.next_index:
@@ -76,7 +82,9 @@ def run_plan(
         first=log.next_index,
     )
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
-    run = run_sequence(plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form)
+    run = run_sequence(
+        plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form, cover=memory.cover
+    )
     key_frames: list[tuple[PreparedFrame, int]] = []
     try:
         for voxel_map, fused in run:
@@ -95,12 +103,12 @@ def run_plan(
             on_frame(fused)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
-                _save(plan, folder, log, voxel_map, key_frames)
+                _save(plan, folder, log, memory, voxel_map, key_frames)
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
-            _save(plan, folder, log, voxel_map, key_frames)
+            _save(plan, folder, log, memory, voxel_map, key_frames)
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
@@ -111,7 +119,8 @@ def run_plan(
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    metrics = _write_outputs(plan, folder, log, voxel_map, _profile(step_profile, program, notify) if profile else {})
+    reader = memory.save(voxel_map, _attributes(plan, log, voxel_map))
+    metrics = _write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
     for note in _notes(plan, log, metrics):
@@ -119,12 +128,73 @@ def run_plan(
     return metrics
 
 
+class _WholeMap:
+    """A map that is in memory as a whole, and saved as a whole."""
+
+    def __init__(self, plan: Plan, path: Path) -> None:
+        self.plan, self.path = plan, path
+
+    def begin(self) -> tuple[VoxelMap, RunLog]:
+        """An empty map, or that of an interrupted run, and its log."""
+        if not holds_map(self.path):
+            return self.plan.mapper.init(), RunLog()
+        voxel_map, attributes = load_map(self.path, members=True)
+        log = RunLog.from_json(attributes.progress, self.path)
+        _check_same(self.plan, voxel_map, log, self.path)
+        return voxel_map, log
+
+    def cover(self, voxel_map: VoxelMap, index: int) -> VoxelMap:
+        """It holds the view of any frame."""
+        return voxel_map
+
+    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """Writes the map."""
+        save_map(self.path, voxel_map, attributes)
+        return in_memory(voxel_map, attributes)
+
+
+class _TiledMap:
+    """A map larger than memory, of which a block moves along with the views."""
+
+    def __init__(self, plan: Plan, path: Path) -> None:
+        assert plan.block_shape is not None
+        self.plan, self.path = plan, path
+        self.block = MovingBlock(TileStore(path, plan.grid, plan.labeller.classes), plan.block_shape)
+        poses = plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified
+        self.boxes = view_boxes(plan.grid, plan.front_end.camera, poses, plan.depth_range_m[1])
+
+    def begin(self) -> tuple[VoxelMap, RunLog]:
+        """An empty block, or one of the map of an interrupted run, and its log."""
+        stored = open_map(self.path)
+        log = RunLog.from_json(stored.attributes.progress, self.path)
+        voxel_map = self.block.begin(stored.frames_fused)
+        _check_same(self.plan, replace(voxel_map, grid=stored.grid), log, self.path)
+        return voxel_map, log
+
+    def cover(self, voxel_map: VoxelMap, index: int) -> VoxelMap:
+        """The block, where it holds the view of a frame."""
+        return self.block.cover(voxel_map, self.boxes[index])
+
+    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """Writes the tiles that have changed, and the attributes, all at once."""
+        self.block.write_changes(voxel_map)
+        self.block.store.commit(int(voxel_map.frames_fused), attributes)
+        if attributes.progress.get("complete"):
+            self.block.store.close()
+        return open_map(self.path)
+
+
 def _save(
-    plan: Plan, folder: RunFolder, log: RunLog, voxel_map: VoxelMap, key_frames: list[tuple[PreparedFrame, int]]
+    plan: Plan,
+    folder: RunFolder,
+    log: RunLog,
+    memory: _WholeMap | _TiledMap,
+    voxel_map: VoxelMap,
+    key_frames: list[tuple[PreparedFrame, int]],
 ) -> None:
     """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
     _write_key_frames(plan, folder, key_frames)
-    save_map(folder.map, voxel_map, _attributes(plan, log, voxel_map))
+    memory.save(voxel_map, _attributes(plan, log, voxel_map))
 
 
 def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
@@ -178,19 +248,17 @@ def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
 
 
 def _write_outputs(
-    plan: Plan, folder: RunFolder, log: RunLog, voxel_map: VoxelMap, details: dict[str, Any]
+    plan: Plan, folder: RunFolder, log: RunLog, reader: MapReader, details: dict[str, Any]
 ) -> dict[str, Any]:
-    """Writes all that a run leaves, and returns its metrics, the details among them."""
-    attributes = _attributes(plan, log, voxel_map)
-    save_map(folder.map, voxel_map, attributes)
+    """Writes all that a run leaves beside its map, and returns its metrics, the details among them."""
     skipped = {frame["frame"] for frame in log.skipped}
     fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
-    write_exports(folder, voxel_map, attributes)
-    metrics = _metrics(plan, log, voxel_map) | count_missed(plan.rule, attributes, voxel_map) | details
+    write_exports(folder, reader)
+    metrics = _metrics(plan, log, reader) | count_missed(plan.rule, reader, plan.members) | details
     write_json(folder.metrics, metrics)
     return metrics
 
@@ -206,33 +274,30 @@ def _profile(step_profile: StepProfile, program: Callable[[], str | None] | None
     return {"profile": summary}
 
 
-def _resumed(plan: Plan, folder: RunFolder) -> tuple[VoxelMap, RunLog] | None:
-    """Where an interrupted run of the same plan has got to.
+def _check_same(plan: Plan, voxel_map: VoxelMap, log: RunLog, where: Path) -> None:
+    """Checks that an interrupted run can go on.
 
     Raises:
         JaxmapError: the sequence has changed since, so that the run cannot go on as if it had not.
     """
-    saved = folder.resume_point()
-    if saved is None:
-        return None
-    voxel_map, log = saved
-    same_frames = log.next_index <= len(plan.sequence.frames) and log.digest == plan.digest(log.next_index)
+    done = log.next_index
+    same_frames = not done or (done <= len(plan.sequence.frames) and log.digest == plan.digest(done))
     # A sequence that has grown since goes on where it ended.
     log.complete = log.complete and log.next_index == len(plan.sequence.frames)
     same_grid = (
         voxel_map.grid.shape == plan.grid.shape
         and voxel_map.classes == plan.labeller.classes
-        and np.array_equal(voxel_map.grid.origin_m, plan.grid.origin_m)
+        and np.array_equal(voxel_map.grid.lattice_m, plan.grid.lattice_m)
+        and np.array_equal(voxel_map.grid.first, plan.grid.first)
         and np.array_equal(voxel_map.grid.voxel_size_m, plan.grid.voxel_size_m)
         and (0 if voxel_map.members is None else len(voxel_map.members)) == plan.members
     )
     if not (same_frames and same_grid):
         raise JaxmapError(
             f"the {'bounds of the map' if same_frames else 'frames, poses or camera'} are not those of the run so far",
-            where=folder.path,
+            where=where.parent,
             fix="bring the sequence back as it was, or map it anew with --overwrite",
         )
-    return saved
 
 
 def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
@@ -258,10 +323,12 @@ def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[Prep
     key_frames.clear()
 
 
-def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
+def _metrics(plan: Plan, log: RunLog, reader: MapReader) -> dict[str, Any]:
     """What metrics.json holds."""
     sequence, camera, grid = plan.sequence, plan.front_end.camera, plan.grid
     steps_m = np.linalg.norm(np.diff(sequence.T_world_camera[:, :3, 3], axis=0), axis=1)
+    block = None if plan.block_shape is None else replace(grid, shape=plan.block_shape)
+    members_bytes = map_bytes(grid, 0, plan.members) - map_bytes(grid, 0)
     camera_numbers = {
         name: round(float(getattr(camera, name)), 6)
         for name in ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m", "doffs_px")
@@ -317,10 +384,11 @@ def _metrics(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> dict[str, Any]:
             if log.disparity
             else {}
         ),
-        "voxels": count_voxels(voxel_map, plan.params.fusion, plan.rule),
+        "voxels": count_voxels(reader, plan.params.fusion, plan.rule),
         "memory": {
-            "map_mib": round(voxel_map.log_odds.nbytes / 2**20, 2),
-            **({"members_mib": round(members.nbytes / 2**20, 2)} if (members := voxel_map.members) is not None else {}),
+            "map_mib": round(map_bytes(plan.grid, len(plan.labeller.classes)) / 2**20, 2),
+            **({"block_mib": round(map_bytes(block, len(plan.labeller.classes)) / 2**20, 2)} if block else {}),
+            **({"members_mib": round(members_bytes / 2**20, 2)} if plan.members else {}),
             "step_temporary_mib": round(log.temporary_bytes / 2**20, 2),
             "peak_resident_mib": round(peak_resident_mib(), 1),
         },

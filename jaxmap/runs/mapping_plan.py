@@ -23,7 +23,8 @@ from jaxmap.ensemble.draws import draw_ensemble
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
-from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, usable_depth
+from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, site_lattice, usable_depth
+from jaxmap.geometry.grid import window_shape
 from jaxmap.geometry.options import GridOptions, Triple
 from jaxmap.host.files import bundled, real_path
 from jaxmap.labellers.base import Labeller, make_no_labeller
@@ -34,66 +35,51 @@ from jaxmap.labellers.relief import combine_with_relief, make_relief_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.sequence import frame_form
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
+from jaxmap.mapping.tiles import block_shape, whole_tiles
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.tensor_files import shortened
 from jaxmap.runs.checking import warn_of_faults
 from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.rectify import StereoRig
-from jaxmap.types import Frame, GridSpec, StereoCamera, make_grid
+from jaxmap.types import MAX_TENSOR_ELEMENTS, Frame, GridSpec, StereoCamera, make_grid
 
 BUNDLED_WIDTH_PX = 512
 """Width that the bundled network runs at: at twice that it takes four times as long for a hundredth of IoU."""
 
-DEFAULT_VOXELS_M: tuple[Triple, ...] = ((0.05, 0.05, 0.2), (0.1, 0.1, 0.2), (0.2, 0.2, 0.2))
-"""The voxels of a map whose settings name none, the finest that fits."""
+DEFAULT_VOXEL_M: Triple = (0.05, 0.05, 0.2)
+"""The voxels of a map whose settings name none."""
 
 
 def choose_grid(
-    config: MapConfig, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float, class_count: int
+    settings: GridOptions, sequence: StereoSequence, front_end: StereoFrontEnd, max_depth_m: float
 ) -> GridSpec:
-    """The grid that the settings ask for; voxels of no given size are as fine as the memory allows.
+    """The grid that the settings ask for, on the lattice of the site.
 
     Args:
-        config: the settings.
+        settings: the bounds and the voxels.
         sequence: whose views it must hold.
         front_end: of the sequence.
         max_depth_m: how far its views reach.
-        class_count: how many classes the map has.
 
     Raises:
         JaxmapError: the bounds do not make a box, or no camera sees it.
     """
-    if config.grid.voxel_size_m is not None:
-        return _grid_of(config.grid, config.grid.voxel_size_m, sequence, front_end, max_depth_m)
-    limit_bytes = config.grid.max_memory_gib * 2**30
-    *finer, coarsest_m = DEFAULT_VOXELS_M
-    for size_m in finer:
-        grid = _grid_of(config.grid, size_m, sequence, front_end, max_depth_m)
-        if map_bytes(grid, class_count, config.ensemble.members) <= limit_bytes:
-            return grid
-    return _grid_of(config.grid, coarsest_m, sequence, front_end, max_depth_m)
-
-
-def _grid_of(
-    settings: GridOptions,
-    voxel_size_m: float | Triple,
-    sequence: StereoSequence,
-    front_end: StereoFrontEnd,
-    max_depth_m: float,
-) -> GridSpec:
+    voxel_size_m = settings.voxel_size_m or DEFAULT_VOXEL_M
+    lattice_m = site_lattice(sequence.site_origin, voxel_size_m)
     views = grid_around_views(
         front_end.camera,
         sequence.T_world_camera @ front_end.T_raw_rectified,
         max_depth_m,
         voxel_size_m,
         (settings.below_camera_m, settings.above_camera_m),
+        lattice_m,
     )
     if (settings.lower_m is None) != (settings.upper_m is None):
         raise UsageError("one of grid.lower_m and grid.upper_m is missing", fix="give both, or neither")
     if settings.lower_m is None or settings.upper_m is None:
         return views
-    grid = make_grid(settings.lower_m, settings.upper_m, voxel_size_m)
+    grid = make_grid(settings.lower_m, settings.upper_m, voxel_size_m, lattice_m)
     lower, upper = _extent(views)
     if (np.array(settings.lower_m) >= upper).any() or (np.array(settings.upper_m) <= lower).any():
         raise UsageError(
@@ -111,13 +97,22 @@ def _extent(grid: GridSpec) -> tuple[np.ndarray, np.ndarray]:
     return lower, lower + np.asarray(grid.voxel_size_m, np.float64) * grid.shape
 
 
-def describe_grid(grid: GridSpec, depth_range_m: tuple[float, float], class_count: int, members: int) -> str:
+def describe_grid(
+    grid: GridSpec,
+    depth_range_m: tuple[float, float],
+    class_count: int,
+    members: int,
+    block: tuple[int, int, int] | None = None,
+) -> str:
     """One line on what is mapped, and the memory it takes."""
+    taken = f"{map_bytes(grid if block is None else replace(grid, shape=block), class_count, members) / 2**20:.0f} MiB"
+    if block is not None:
+        taken = f"in tiles on disk, {' x '.join(map(str, block))} voxels around the rover in memory, {taken}"
     size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
     return (
         f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
         f"{size} m, {1 + class_count} channels{f' and {members} members of 2' if members else ''}: "
-        f"{map_bytes(grid, class_count, members) / 2**20:.0f} MiB"
+        f"{taken}"
     )
 
 
@@ -259,6 +254,8 @@ class Plan:
     key: PRNGKeyArray
     pose_errors: Float[np.ndarray, "N M 6"] | None = None
     """Of the members of an ensemble, for each frame."""
+    block_shape: tuple[int, int, int] | None = None
+    """Of a map that is larger than the memory it may take: voxels along each axis of the part that is in memory."""
     findings: tuple[Finding, ...] = ()
     """What the quick check of the sequence has found."""
 
@@ -299,7 +296,14 @@ class Plan:
         return hashlib.sha256(repr((described, camera)).encode() + poses.tobytes()).hexdigest()[:16]
 
 
-def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame = lambda done, total: None) -> Plan:
+def plan_run(
+    source: str,
+    config: MapConfig,
+    notify: Notify,
+    on_frame: OnFrame = lambda done, total: None,
+    *,
+    in_tiles: bool = False,
+) -> Plan:
     """Opens the sequence and decides range, bounds, labeller and step.
 
     Args:
@@ -307,6 +311,7 @@ def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame =
         config: the settings.
         notify: takes lines for the user.
         on_frame: is told of the progress of odometry, where it gives the poses.
+        in_tiles: a map that takes more memory than it may is kept in tiles, not refused.
 
     Raises:
         JaxmapError: the data or the settings do not serve.
@@ -328,12 +333,22 @@ def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame =
         labeller = choose_labeller(config, label_folder, network, front_end.camera)
         if model is not None and network is not None:
             notify(describe_network(model, network, labeller.classes))
-        grid = choose_grid(config, sequence, front_end, depth_range_m[1], len(labeller.classes))
+        grid = choose_grid(config.grid, sequence, front_end, depth_range_m[1])
         rule = config.fusion.rule(labeller.classes)
         fusion_params = make_fusion_params(labeller.classes, config.fusion)
         members = _members(config, rule, labeller.classes)
-    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members))
-    check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
+    # The members of an ensemble stand elsewhere.
+    T_known = None if members else sequence.T_world_camera @ front_end.T_raw_rectified
+    block = None
+    limit_bytes = min(config.grid.max_memory_gib * 2**30, 4 * MAX_TENSOR_ELEMENTS)
+    if in_tiles and not members and map_bytes(grid, len(labeller.classes)) > limit_bytes:
+        shape = window_shape(grid, camera, depth_range_m[1], T_known)
+        block = block_shape(whole_tiles(grid), shape, 1 + len(labeller.classes), limit_bytes)
+    if block is None:
+        check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
+    else:
+        grid = whole_tiles(grid)
+    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block))
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
     if members:
@@ -354,16 +369,16 @@ def plan_run(source: str, config: MapConfig, notify: Notify, on_frame: OnFrame =
         fusion=fusion_attribute(config.fusion, rule) | ({"ensemble": asdict(config.ensemble)} if members else {}),
         mapper=make_mapper(
             camera,
-            grid,
+            grid if block is None else replace(grid, shape=block),
             labeller,
             rule,
             depth_range_m,
             members=members,
-            # The members of an ensemble stand elsewhere.
-            T_world_camera=None if members else sequence.T_world_camera @ front_end.T_raw_rectified,
+            T_world_camera=T_known,
         ),
         key=key,
         pose_errors=pose_errors,
+        block_shape=block,
         findings=findings,
     )
 

@@ -28,7 +28,7 @@ from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, range_weight
 from jaxmap.geometry.camera import depth_sigma
 from jaxmap.geometry.cloud import project
-from jaxmap.geometry.grid import flat_voxel_index, view_window, whole_window, window_shape
+from jaxmap.geometry.grid import flat_voxel_index, view_window, window_shape
 from jaxmap.labellers.base import Labeller, Numbers, fusible, harden, labels_of
 from jaxmap.mapping.step import MapperParams
 from jaxmap.tuning.options import BLOCK_PX
@@ -157,18 +157,16 @@ def _observer(recipe: CacheRecipe) -> Any:
         window = view_window(recipe.grid, params.camera, pose, max_depth_m, size)
         free = None
         if recipe.rule.carve:
-            free = carve(
-                params.camera, pose, cloud.depth_m, cloud.valid, recipe.grid, fusion, recipe.depth_range_m, window
-            )
+            free = carve(params.camera, pose, cloud.depth_m, cloud.valid, window, fusion, recipe.depth_range_m)
         keep &= jnp.isfinite(values).all(axis=-1)
         return {
-            "voxel": flat_voxel_index(recipe.grid, cloud.points_world, keep, whole_window(recipe.grid)),
+            "voxel": flat_voxel_index(recipe.grid, cloud.points_world, keep),
             "voxels": jnp.asarray(int(np.prod(recipe.grid.shape))),
             "depth_m": cloud.depth_m.reshape(-1),
             "values": values,
             "of_frame": of_frame,
             "free": free,
-            "start": window.start,
+            "start": window.first - recipe.grid.first,
         }
 
     return observe

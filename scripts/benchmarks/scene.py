@@ -17,13 +17,13 @@ from PIL import Image
 from jaxmap.datasets import open_sequence
 from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE
 from jaxmap.datasets.poses import write_tum
-from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M
+from jaxmap.runs.mapping_plan import DEFAULT_VOXEL_M
 from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.types import GridSpec, StereoCamera, make_grid, make_stereo_camera
 
 IMAGE_PX = {"small": (512, 384), "medium": (1024, 768), "large": (2048, 1536)}
 """Width and height; the LocCam's in the middle."""
-VOXEL_M = {"small": (0.4, 0.4, 0.4), "medium": (0.2, 0.2, 0.2), "large": DEFAULT_VOXELS_M[0]}
+VOXEL_M = {"small": (0.4, 0.4, 0.4), "medium": (0.2, 0.2, 0.2), "large": DEFAULT_VOXEL_M}
 """The paper's voxels in the middle, the default ones last."""
 DISPARITIES = 128
 """Searched where matching is timed, at all sizes."""

@@ -27,7 +27,7 @@ from strategies import (
 from jaxmap.fusion import integrate as kernels
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
-from jaxmap.geometry.grid import Window, view_window, window_shape
+from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.types import PointLabels, make_grid, make_stereo_camera, make_voxel_map
 
 fuse = jax.jit(kernels.integrate, static_argnames="rule")
@@ -142,7 +142,7 @@ def test_shifting_grid_and_points_by_whole_voxels_shifts_the_map(grid, rng, shif
     move_m = np.array(shift) * np.asarray(grid.voxel_size_m)
     here, _ = fuse(make_voxel_map(grid, CLASSES), points, labels, weights, PARAMS, SUM)
     # The grid moved with the points: the same map.
-    moved_grid = replace(grid, origin_m=grid.origin_m + move_m)
+    moved_grid = replace(grid, lattice_m=grid.lattice_m + move_m)
     moved, _ = fuse(make_voxel_map(moved_grid, CLASSES), points + move_m, labels, weights, PARAMS, SUM)
     np.testing.assert_array_equal(moved.log_odds, here.log_odds)
     # The points alone moved by one voxel: the map shifts along.
@@ -160,8 +160,7 @@ def test_a_window_that_holds_the_points_gives_the_map_of_the_whole_grid(grid, rn
     index = start + rng.integers(0, shape, (POINTS, 3))
     points = np.asarray(grid.origin_m) + (index + rng.integers(1, 16, (POINTS, 3)) / 16) * np.asarray(grid.voxel_size_m)
     points = points.astype(np.float32)
-    part = replace(grid, origin_m=grid.origin_m + start * grid.voxel_size_m, shape=shape)
-    window = Window(jnp.asarray(start, jnp.int32), part)
+    window = replace(grid, first=jnp.asarray(start, jnp.int32), shape=shape)
     box = tuple(slice(a, a + n) for a, n in zip(start, shape, strict=True))
     free = np.zeros(GRID_SHAPE, bool)
     free[box] = rng.random(shape) < 0.5

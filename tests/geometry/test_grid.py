@@ -69,12 +69,12 @@ def test_view_window_holds_every_voxel_the_camera_can_reach(camera, T_world_came
     grid = make_grid([-12, -10, -2], [12, 10, 2], size_m)
     shape = kernels.window_shape(grid, camera, max_depth_m)
     window = kernels.view_window(grid, camera, T_world_camera, max_depth_m, shape)
-    start, stop = np.asarray(window.start), np.asarray(window.start) + shape
+    start, stop = np.asarray(window.first), np.asarray(window.first) + shape
     assert np.all(start >= 0)
     assert np.all(stop <= grid.shape)
-    assert window.grid.shape == shape
+    assert window.shape == shape
     np.testing.assert_allclose(
-        window.grid.origin_m, reference.f64(grid.origin_m) + start * reference.f64(grid.voxel_size_m), atol=1e-5
+        window.origin_m, reference.f64(grid.origin_m) + start * reference.f64(grid.voxel_size_m), atol=1e-5
     )
     rng = np.random.default_rng(0)
     depth_m = rng.uniform(0.05, max_depth_m, (HEIGHT_PX, WIDTH_PX))
@@ -93,7 +93,7 @@ def test_a_window_for_known_poses_holds_their_views_and_is_no_larger_than_one_fo
     assert np.all(np.array(shape) <= kernels.window_shape(grid, camera, max_depth_m))
     corners = frustum_corners(camera, max_depth_m)
     for pose in known:
-        start = np.asarray(kernels.view_window(grid, camera, pose, max_depth_m, shape).start)
+        start = np.asarray(kernels.view_window(grid, camera, pose, max_depth_m, shape).first)
         # By the kernel, in float32: points are put into voxels by the same rounding that places the window.
         index, inside = map(np.asarray, to_voxel(grid, transform_points(pose, corners)))
         assert np.all((index[inside] >= start) & (index[inside] < start + shape))
@@ -105,7 +105,7 @@ def test_view_window_of_a_pose_that_is_no_place_stays_in_the_grid():
     shape = kernels.window_shape(grid, camera, 2.0)
     for bad in BAD_NUMBERS:
         pose = jaxlie.SE3.from_translation(jnp.array([bad, 0.0, 0.0]))
-        start = np.asarray(see(grid, camera, pose, 2.0, shape=shape).start)
+        start = np.asarray(see(grid, camera, pose, 2.0, shape=shape).first)
         assert np.all(start >= 0)
         assert np.all(start + shape <= grid.shape)
 

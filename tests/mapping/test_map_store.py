@@ -35,7 +35,7 @@ def small_map(
     value: float = 1.0, classes: tuple[str, ...] = ("sand", "rock"), shape=(5, 4, 3), frames: int = 7
 ) -> VoxelMap:
     grid = GridSpec(
-        origin_m=jnp.array([-1.1, 0.3, 1e-3], jnp.float32),
+        lattice_m=jnp.array([-1.1, 0.3, 1e-3], jnp.float32),
         voxel_size_m=jnp.array([0.1, 0.2, 0.3], jnp.float32),
         shape=shape,
     )
@@ -382,7 +382,7 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path, monkeypatch, value) -
     with pytest.raises(JaxmapError, match="6 of the log-odds are not finite"):
         save_map(path, small_map(value), MapAttributes())
     with monkeypatch.context() as patch:
-        patch.setattr(map_store, "_check_finite", lambda *_: None)
+        patch.setattr(map_store, "check_finite", lambda *_: None)
         save_map(path, small_map(value), MapAttributes())
     with pytest.raises(JaxmapError, match="6 of the log-odds are not finite"):
         load_map(path)

@@ -14,17 +14,15 @@ from PIL import Image
 from planned_runs import config_of, log_odds, metrics_of, planned, ran, voxels_of
 from scenes import BASELINE_M, BOXES_M, ROCK, SAND, frame_name, pose, scene_frame, timestamp_s, write_folder_sequence
 
-import jaxmap.runs.mapping_plan
 from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels
-from jaxmap.geometry.bounds import grid_around_views, map_bytes
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.store import load_map
 from jaxmap.runs.config import MapConfig, check_config, config_tree, load_config
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping import run_plan
-from jaxmap.runs.mapping_plan import DEFAULT_VOXELS_M, plan_run
+from jaxmap.runs.mapping_plan import DEFAULT_VOXEL_M, plan_run
 
 OUTPUTS = ("map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "config.yaml", "poses.tum", "report.html")
 
@@ -166,34 +164,12 @@ def test_automatic_bounds_hold_the_scene_and_lie_on_whole_voxels(scene_folder):
     config = config_tree(MapConfig())
     plan = plan_run(str(scene_folder), check_config(config), lambda line: None)
     origin = np.asarray(plan.grid.origin_m, np.float64)
-    voxel_size_m = np.array(DEFAULT_VOXELS_M[0])
+    voxel_size_m = np.array(DEFAULT_VOXEL_M)
     np.testing.assert_allclose(plan.grid.voxel_size_m, voxel_size_m, atol=1e-6)
     np.testing.assert_allclose(origin / voxel_size_m, np.rint(origin / voxel_size_m), atol=1e-4)
     upper = origin + np.array(plan.grid.shape) * voxel_size_m
     assert (origin <= BOXES_M[:, 0].min(axis=0)).all() and (upper >= BOXES_M[:, 1].max(axis=0)).all()
     assert plan.depth_range_m == (0.3, 4.0)
-
-
-@pytest.mark.parametrize("fitting", range(len(DEFAULT_VOXELS_M)))
-def test_voxels_of_no_given_size_are_the_finest_that_fit(scene_folder, fitting):
-    fine = [planned(scene_folder, grid={"voxel_size_m": list(size)}).grid for size in DEFAULT_VOXELS_M]
-    limit_gib = map_bytes(fine[fitting], 3) / 2**30
-    plan = planned(scene_folder, grid={"max_memory_gib": limit_gib})
-    np.testing.assert_allclose(plan.grid.voxel_size_m, DEFAULT_VOXELS_M[fitting], atol=1e-6)
-
-
-def test_no_grid_is_made_that_is_not_needed(scene_folder, monkeypatch):
-    made = []
-
-    def counted(*words):
-        made.append(grid_around_views(*words))
-        return made[-1]
-
-    monkeypatch.setattr(jaxmap.runs.mapping_plan, "grid_around_views", counted)
-    plan = planned(scene_folder)
-    assert len(made) == 1
-    planned(scene_folder, grid={"max_memory_gib": map_bytes(plan.grid, 3) / 2**30 / 2})
-    assert len(made) == 1 + 2
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,13 @@ from planned_runs import config_of, log_odds, metrics_of, planned
 from scenes import write_folder_sequence
 
 from jaxmap.errors import JaxmapError
+from jaxmap.geometry.bounds import map_bytes
 from jaxmap.mapping import store as map_store
 from jaxmap.mapping.sequence import FusedFrame
-from jaxmap.mapping.store import load_map
+from jaxmap.mapping.store import load_map, open_map
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping import run_plan
+from jaxmap.runs.mapping_plan import plan_run
 
 
 class Cut(Exception):
@@ -366,3 +369,40 @@ def test_a_full_disk_at_the_end_leaves_a_map_to_resume(writer, cli, scene_folder
         assert cli(*map_words(scene_folder, tmp_path / "run")).status == 1
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
     same_run(tmp_path / "run", finished_run)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interrupted", [None, 3])
+def test_a_map_in_tiles_has_the_bits_of_the_whole_one(scene_folder, tmp_path, interrupted):
+    words = {"grid": {"voxel_size_m": 0.05, "lower_m": [-8, -8, -2], "upper_m": [16, 16, 2]}, "labeller": "plane"}
+    whole_config = config_of(**words)
+    plan = plan_run(str(scene_folder), whole_config, lambda line: None, in_tiles=True)
+    assert plan.block_shape is None
+    folder = RunFolder(tmp_path / "whole")
+    folder.begin(plan.settings(whole_config), resume=False, overwrite=False)
+    run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=lambda line: None, report=False)
+
+    limit_gib = map_bytes(plan.grid, len(plan.labeller.classes)) / 2**30 * 0.9
+    tiled_config = config_of(**words | {"grid": {**words["grid"], "max_memory_gib": limit_gib}})
+    plan = plan_run(str(scene_folder), tiled_config, lambda line: None, in_tiles=True)
+    assert plan.block_shape is not None
+    assert np.prod(plan.block_shape) < np.prod(plan.grid.shape)
+    tiled = RunFolder(tmp_path / "tiled")
+    tiled.begin(plan.settings(tiled_config), resume=False, overwrite=False)
+
+    def interrupt(fused):
+        if fused.prepared.index == interrupted:
+            raise KeyboardInterrupt
+
+    with suppress(KeyboardInterrupt):
+        run_plan(plan, tiled, strict=True, checkpoint_every_s=0.0, notify=print, on_frame=interrupt, report=False)
+    if interrupted is not None:
+        plan = plan_run(str(scene_folder), tiled_config, lambda line: None, in_tiles=True)
+        run_plan(plan, tiled, strict=True, checkpoint_every_s=0.0, notify=print, report=False)
+    expected, _ = load_map(folder.map)
+    found, _ = load_map(tiled.map)
+    offset = np.asarray(expected.grid.first) - np.asarray(found.grid.first)
+    part = tuple(slice(a, a + n) for a, n in zip(offset, expected.grid.shape, strict=True))
+    inside = np.asarray(found.log_odds)[(slice(None), *part)]
+    np.testing.assert_array_equal(inside, expected.log_odds)
+    assert open_map(tiled.map).attributes.progress["complete"]

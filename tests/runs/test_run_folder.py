@@ -14,7 +14,7 @@ import yaml
 from fixtures import cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 
 from jaxmap.host.files import atomic_path, bundled
-from jaxmap.mapping.store import load_map
+from jaxmap.mapping.store import load_map, open_map
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping import run_plan
 
@@ -131,7 +131,7 @@ def test_an_interrupt_saves_what_is_there(scene_folder, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=told.append, on_frame=interrupt)
     assert told[-1] == "interrupted and saved after 3 frames; --resume goes on there"
-    assert folder.resume_point()[1].next_index == 3
+    assert open_map(folder.map).attributes.progress["next_index"] == 3
 
 
 def test_what_ends_a_job_is_told_like_ctrl_c(cli, scene_folder, tmp_path):
