@@ -218,7 +218,7 @@ class VoxelMap:
     Channel 0 is occupancy, channel `1 + c` is class `c`. A voxel that nothing has touched holds
     exact zeros; priors are added when the map is read (`fusion.query`), so that maps can be summed.
     `members` are those of an ensemble (`ensemble.members`), two channels each, where there is one; `surface` are the
-    sums of heights of each column (`fusion.surface`), where they are kept.
+    heights of each column (`fusion.surface`), where they are kept.
     """
 
     log_odds: Float[Array, "K X Y Z"]
@@ -230,7 +230,7 @@ class VoxelMap:
 
 
 def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0, *, surface: bool = False) -> VoxelMap:
-    """An empty map, with as many members of an ensemble, and sums of heights where asked for.
+    """An empty map, with as many members of an ensemble, and statistics of heights where asked for.
 
     Raises:
         JaxmapError: the tensor would have more elements than a 32-bit index can reach.

@@ -21,7 +21,7 @@ from jaxmap.fusion.integrate import add_evidence, count_points
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
-from jaxmap.fusion.surface import add_heights, height_sigma, sum_heights
+from jaxmap.fusion.surface import add_heights, gather_heights, height_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
@@ -120,8 +120,8 @@ def fuse_frame(
 
     if fused.surface is not None:
         sigma_m = height_sigma(cloud, pose.translation()[2])
-        heights = sum_heights(grid, cloud.points_world, sigma_m, labels.keep, window)
-        fused = replace(fused, surface=add_heights(fused.surface, heights, window))
+        heights = gather_heights(window, cloud.points_world, sigma_m, labels.keep)
+        fused = replace(fused, surface=add_heights(voxel_map, heights, window))
 
     hits = total_weight(counts) > 0
     report = StepReport(

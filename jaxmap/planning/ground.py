@@ -22,6 +22,9 @@ from jaxmap.types import GridSpec, VoxelMap
 _REACH_M = 0.1
 """Columns so far around lend their points to far ground, of which there are few."""
 
+LEAST_COLUMNS = 1.4
+"""Columns in the radius of a rover, at least: a plane needs heights around its middle."""
+
 SURFACE_LAYER, SIGMA_LAYER = "surface_m", "surface_sigma_m"
 """Names of a map's layers: height of the surface (world z) and its standard deviation; NaN where it is not known."""
 
@@ -53,8 +56,8 @@ def read_ground(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule, roc
     probability = np.zeros(top.observed.shape, np.float32)
     if rock is not None:
         probability = np.asarray(top.probability[voxel_map.classes.index(rock)])
-    reach = round(_REACH_M / min(cell_size(voxel_map.grid)))
-    return Ground(read_surface(voxel_map, params, reach=reach), probability, np.asarray(top.observed))
+    surface = read_surface(voxel_map, params, reach=_reach(cell_size(voxel_map.grid)))
+    return Ground(surface, probability, np.asarray(top.observed))
 
 
 def cell_size(grid: GridSpec) -> tuple[float, float]:
@@ -69,7 +72,7 @@ def hazards_of(surface: Surface, cell_m: tuple[float, float], rover: RoverOption
     Raises:
         JaxmapError: the cells are too large for it.
     """
-    if rover.radius_m < 1.4 * max(cell_m):
+    if rover.radius_m < LEAST_COLUMNS * max(cell_m):
         raise JaxmapError(
             f"a rover of radius {rover.radius_m:g} m on columns of {max(cell_m):g} m",
             where="rover",
@@ -86,6 +89,24 @@ def ground_layers(surface: Surface, hazards: Hazards) -> dict[str, Float[np.ndar
     return named | {name: np.asarray(values) for name, values in hazards._asdict().items()}
 
 
-def absolute(layers: Mapping[str, Float[np.ndarray, "X Y"]], site_z_m: float) -> dict[str, Float[np.ndarray, "X Y"]]:
+def map_layers(voxel_map: VoxelMap, params: FusionParams) -> dict[str, Float[np.ndarray, "X Y"]]:
+    """The layers of a map's ground: heights that are good to some centimetres, and hazards for the usual rover.
+
+    None of a map that keeps no heights, or whose columns are too large for hazards.
+    """
+    rover, cell_m = RoverOptions(), cell_size(voxel_map.grid)
+    if voxel_map.surface is None or rover.radius_m < LEAST_COLUMNS * max(cell_m):
+        return {}
+    around = read_surface(voxel_map, params, reach=_reach(cell_m))
+    return ground_layers(read_surface(voxel_map, params), hazards_of(around, cell_m, rover))
+
+
+def absolute_layers(
+    layers: Mapping[str, Float[np.ndarray, "X Y"]], site_z_m: float
+) -> dict[str, Float[np.ndarray, "X Y"]]:
     """The layers with heights in the coordinate reference system of the site."""
     return {name: values + site_z_m if name == SURFACE_LAYER else values for name, values in layers.items()}
+
+
+def _reach(cell_m: tuple[float, float]) -> int:
+    return round(_REACH_M / min(cell_m))

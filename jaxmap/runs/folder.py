@@ -28,6 +28,7 @@ from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.host.replacement import Replacement
 from jaxmap.mapping.store import MapReader, holds_map, load_map, stray_maps
+from jaxmap.planning.ground import absolute_layers
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
 from jaxmap.report.top_down import missed_picture, top_down_picture
 from jaxmap.stereo.front_end import RectifiedFrame
@@ -218,7 +219,14 @@ def write_exports(folder: RunFolder, reader: MapReader, formats: Sequence[str] =
     top: TopDown = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
     if "geotiff" in formats:
         where = (attributes.crs, attributes.site_origin)
-        write_geotiff(folder.geotiff, top, voxel_map.grid, voxel_map.classes, *where, layers=attributes.layers)
+        write_geotiff(
+            folder.geotiff,
+            top,
+            voxel_map.grid,
+            voxel_map.classes,
+            *where,
+            layers=absolute_layers(attributes.layers, where[1][2]),
+        )
     if "png" in formats:
         path_world = None
         if folder.poses.exists():
