@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
 _RAMP = ["#e9e6d8", "#f6d58a", "#ee9a4d", "#c9502c", "#7d1f3f"]
-_BARRED, _ROCK_LINE = (88, 92, 104), "#3b2436"
+_BARRED, _ROCK_LINE = (138, 141, 152), "#3b2436"
 _MOST_COST = 10.0
 """Costs from here on have the last colour."""
 _LIGHT = 0.35
@@ -83,7 +83,7 @@ def plan_colours(
     shade = ground_shade(np.asarray(height_m, np.float64), ground.seen, cell_size_m)
     scaled = ((costs.cost.clip(1, _MOST_COST) - 1) / (_MOST_COST - 1))[..., None]
     base = np.array(_colour_map()(scaled[..., 0], bytes=True))[..., :3].astype(np.float64)
-    base = np.where(costs.drivable[..., None], base, 0.45 * base + 0.55 * np.array(_BARRED))
+    base = np.where(costs.drivable[..., None], base, 0.15 * base + 0.85 * np.array(_BARRED))
     lit = base * (1 - _LIGHT + _LIGHT * shade[..., None])
     colours[seen] = np.rint(lit[seen]).clip(0, 255)
     return colours

@@ -5,9 +5,9 @@
 Worlds of new seeds are rendered into the folder, each once (extra `sim`; minutes each), so that more can be added;
 `--known` names folders that `jaxmap simulate` has written already. In each world, pairs of places are drawn that
 are free in truth, in view, at least 3 m apart, and between which true rock bars the straight way wherever there
-are such pairs. Prints, for each way to see rocks, how many paths were found and how many of them collide: come closer to
-a true rock of more than 0.3 m than the rover's radius; and their length over that with the truth known. Rows
-plane, network and relief plan by what labels say alone; hazards by heights alone; ours by both.
+are such pairs. Prints, for each way to see rocks, how many paths were found and how many of them collide: come closer
+to a true rock of more than 0.3 m than the rover's radius; and their length over that with the truth known.
+Rows plane, network and relief plan by what labels say alone; hazards by heights alone; ours by both.
 """
 
 from __future__ import annotations
