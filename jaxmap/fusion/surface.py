@@ -1,10 +1,10 @@
 """The height of the surface in each column, finer than voxels: statistics of its points, fused beside the map.
 
 A voxel says no more of a height than its own edge. What each column keeps is what rovers keep of the cells of their
-maps (Goldberg, Maimone and Matthies 2002, "Stereo vision and rover navigation software for planetary exploration"): how many
-points there were, and the mean of their heights and the scatter about it. They add up over frames, maps and processes
-like all evidence, by the formulas of Chan, Golub and LeVeque (1983, "Algorithms for computing the sample variance"),
-which lose no digits however high the ground lies.
+maps (Goldberg, Maimone and Matthies 2002, "Stereo vision and rover navigation software for planetary exploration"):
+how many points there were, and the mean of their heights and the scatter about it. They add up over frames, maps and
+processes like all evidence, by the formulas of Chan, Golub and LeVeque (1983, "Algorithms for computing the sample
+variance"), which lose no digits however high the ground lies.
 """
 
 from __future__ import annotations
