@@ -6,8 +6,8 @@ Worlds of new seeds are rendered into the folder, each once (extra `sim`; minute
 `--known` names folders that `jaxmap simulate` has written already. In each world, pairs of places are drawn that
 are free in truth, in view, at least 3 m apart, and between which true rock bars the straight way wherever there
 are such pairs. Prints, for each way to see rocks, how many paths were found and how many of them collide: come closer
-to a true rock of more than 0.3 m than the rover's radius; and their length over that with the truth known.
-Rows plane, network and relief plan by what labels say alone; hazards by heights alone; ours by both.
+to a true rock of more than 0.3 m than the rover's radius; and their length over that of the same planner where it
+knows true heights and all rocks of more than 0.3 m. Rows plane, network and relief plan by what labels say alone; hazards by heights alone; ours by both.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SEEN_BY = {
 
 
 class Truth(NamedTuple):
-    """The true ground on the columns of a map, and those of it that belong to large rocks."""
+    """The true ground on the columns of a map, of rocks the large ones alone; and where these are."""
 
     ground: Ground
     large_rock: np.ndarray
@@ -79,7 +79,7 @@ def read_truth(gt: Path, grid: GridSpec, plan: Plan) -> Truth:
     large = rock & (diameter_m > LEAST_ROCK_M)[numbered]
     known = np.isfinite(height_m)
     surface = Surface(np.nan_to_num(height_m).astype(np.float32), np.zeros(known.shape, np.float32), known)
-    return Truth(Ground(surface, rock.astype(np.float32), known), large)
+    return Truth(Ground(surface, large.astype(np.float32), known), large)
 
 
 def sample(values: np.ndarray, T_crs_pixel: np.ndarray, x: np.ndarray, y: np.ndarray, outside: float) -> np.ndarray:
@@ -119,8 +119,7 @@ def ways(frames: Frames, rover: RoverOptions, world: Traverse) -> tuple[dict[str
         ground = read_ground(voxel_map, plan.params.fusion, plan.rule, rock)
         if not seen_by:
             truth = read_truth(world.gt, voxel_map.grid, plan)
-            bare = truth.ground._replace(rock_probability=np.zeros_like(truth.ground.rock_probability))
-            seen_by["truth"] = costs_of(voxel_map, attributes, bare, rover, "rock")
+            seen_by["truth"] = costs_of(voxel_map, attributes, truth.ground, rover, "rock")
         if name == "ours":
             blind = ground._replace(rock_probability=np.zeros_like(ground.rock_probability))
             seen_by["hazards"] = costs_of(voxel_map, attributes, blind, rover, rock)
@@ -131,11 +130,10 @@ def ways(frames: Frames, rover: RoverOptions, world: Traverse) -> tuple[dict[str
     far_m = np.full(truth.large_rock.shape, np.inf)
     if truth.large_rock.any():
         far_m = np.asarray(distance_transform_edt(~truth.large_rock, sampling=tuple(cell_m)))
-    # Who knows the truth takes the shortest way that the rover can drive, just off the large rocks.
+    # Who knows the truth never touches a large rock, whatever a detour costs.
     terrain = seen_by["truth"].terrain
-    drivable = terrain.drivable & (far_m >= rover.radius_m)
-    shortest = terrain._replace(drivable=drivable, cost=np.ones_like(terrain.cost))
-    return {**seen_by, "truth": replace(seen_by["truth"], terrain=shortest)}, far_m
+    free = terrain._replace(drivable=terrain.drivable & (far_m >= rover.radius_m))
+    return {**seen_by, "truth": replace(seen_by["truth"], terrain=free)}, far_m
 
 
 class Tally:
@@ -176,9 +174,9 @@ def main() -> None:
         pairs = draw_pairs(seen_by["truth"], in_view, far_m < rover.radius_m + rover.margin_m, given.pairs, number)
         for ends in pairs:
             site = seen_by["truth"].attributes.site_origin[:2]
-            shortest_m = plan_path(seen_by["truth"], *(ends + site)).metrics["length_m"]
+            truth_m = plan_path(seen_by["truth"], *(ends + site)).metrics["length_m"]
             for name, costs in seen_by.items():
-                tallies.setdefault(name, Tally()).add(costs, ends, far_m, rover.radius_m, shortest_m)
+                tallies.setdefault(name, Tally()).add(costs, ends, far_m, rover.radius_m, truth_m)
         print(f"{folder.name}: {len(pairs)} pairs", flush=True)
     table = Table(
         {"seen by": "<10", "pairs": "7d", "no path": "9d", "collide": "9d", "mean longer": "13.1%", "worst": "9.1%"}
