@@ -136,13 +136,15 @@ def read_surface(voxel_map: VoxelMap, params: FusionParams, most_sigma_m: float 
 
 def _heights_around(statistics: Float[Array, "4 X Y"], reach: int) -> tuple[Array, Array, Array]:
     """Mean height of the columns up to so far around each, its variance, and the number of points."""
-    padded = jnp.pad(statistics, [(0, 0), (reach, reach), (reach, reach)])
-    _, x, y = statistics.shape
+    offsets = [(i, j) for i in range(2 * reach + 1) for j in range(2 * reach + 1) if (i, j) != (reach, reach)]
     total = statistics
-    for i in range(2 * reach + 1):
-        for j in range(2 * reach + 1):
-            if (i, j) != (reach, reach):
-                total = combine(total, padded[:, i : i + x, j : j + y])
+    if offsets:
+        padded = jnp.pad(statistics, [(0, 0), (reach, reach), (reach, reach)])
+
+        def add(total: Array, offset: Array) -> tuple[Array, None]:
+            return combine(total, jax.lax.dynamic_slice(padded, (0, *offset), statistics.shape)), None
+
+        total, _ = jax.lax.scan(add, statistics, jnp.array(offsets))
     count, weight, mean_m, square = total
     weight = jnp.maximum(weight, _LEAST_WEIGHT)
     scatter = jnp.maximum(square, count) / weight

@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float
 
 _LEAST_CELLS = 4
 """Through fewer heights there always is a plane."""
-_AROUND = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 _FLATTEST = 1e-3
 """Least spread of the cells of a disc, as a part of its radius squared: along a line there is no plane."""
 
@@ -96,8 +95,8 @@ def measure_hazards(
     jumps = _jumps(z, variance, known, plane, enough, disc, cell_m, gap_m)
     square, jump, jump_variance = _over_disc(z, known, plane, disc, cell_m, jumps)
     freedom = jnp.maximum(plane.count - 3, 1.0)
-    roughness_m = jnp.sqrt(square / plane.count.clip(1))
-    tangent = jnp.hypot(plane.slope_x, plane.slope_y)
+    roughness_m = _root(square / plane.count.clip(1))
+    tangent = _root(plane.slope_x**2 + plane.slope_y**2)
     # Of a plane through cells of equal variance; the disc is near to round, so it is that of any direction.
     spread = jnp.sqrt(plane.determinant.clip(1e-12))
     slope_sigma = jnp.sqrt(plane.variance / spread) / (1 + tangent**2)
@@ -174,6 +173,17 @@ def _fit_planes(
     return _Planes(height, slope_x, slope_y, n, determinant, noise / count)
 
 
+class _Cells(NamedTuple):
+    """What a jump is made of: heights and their variances, and the slopes of planes where they are fitted."""
+
+    z: Array
+    variance: Array
+    known: Array
+    slope_x: Array
+    slope_y: Array
+    fitted: Array
+
+
 def _jumps(
     z: Array,
     variance: Array,
@@ -187,28 +197,31 @@ def _jumps(
     """The greatest jump from each cell to one a gap away, less its sigma, and its variance; -1 where there is none."""
     gap = np.array([max(1, round(gap_m / size)) for size in cell_m])
     reach = tuple((gap + disc.reach).tolist())
-    pads = [_padded(field, reach, 0) for field in (z, variance, known, plane.slope_x, plane.slope_y, fitted)]
+    fields = _Cells(z, variance, known, plane.slope_x, plane.slope_y, fitted)
+    pads = _Cells(*(_padded(field, reach, 0) for field in fields))
+    ways = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
+    # Discs that end at the two cells: whatever jumps between these makes neither lean.
+    aside = np.rint(ways / np.linalg.norm(ways, axis=1, keepdims=True) * disc.reach).astype(int)
 
-    def at(offset: np.ndarray) -> list[Array]:
-        return [_shifted(pad, jnp.asarray(offset), reach, z.shape) for pad in pads]
+    def at(offset: Array) -> _Cells:
+        return _Cells(*(_shifted(pad, offset, reach, z.shape) for pad in pads))
 
-    best, noise = jnp.full_like(z, -1.0), jnp.zeros_like(z)
-    for direction in _AROUND:
-        ahead = np.array(direction) * gap
-        # Discs that end at the two cells: whatever jumps between these makes neither lean.
-        aside = np.rint(np.array(direction) / np.hypot(*direction) * disc.reach).astype(int)
-        end, beyond, behind, here = at(ahead), at(ahead + aside), at(-aside), at(0 * ahead)
+    def take(found: tuple[Array, Array], way: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+        (best, noise), (ahead, aside) = found, way
+        end, beyond, behind = at(ahead), at(ahead + aside), at(-aside)
+        x, y = ahead[0] * cell_m[0], ahead[1] * cell_m[1]
 
-        def left(of: list[Array], rise: Array = end[0] - z, run: np.ndarray = ahead * cell_m) -> Array:
-            return jnp.abs(rise - run[0] * of[3] - run[1] * of[4])
+        def left(ground: _Cells) -> Array:
+            return jnp.where(ground.fitted, jnp.abs(end.z - z - x * ground.slope_x - y * ground.slope_y), jnp.inf)
 
-        sides = [jnp.where(of[5], left(of), jnp.inf) for of in (beyond, behind)]
-        jump = jnp.minimum(*sides)
-        jump = jnp.where(jump < jnp.inf, jump, left(here))
-        both = variance + end[1]
-        jump = jnp.where(known & end[2] & (here[5] | beyond[5] | behind[5]), jump - jnp.sqrt(both), -1.0)
-        best, noise = jnp.maximum(best, jump), jnp.where(jump > best, both, noise)
-    return best, noise
+        jump = jnp.minimum(left(beyond), left(behind))
+        jump = jnp.where(jump < jnp.inf, jump, left(fields))
+        both = variance + end.variance
+        jump = jnp.where(known & end.known & (jump < jnp.inf), jump - _root(both), -1.0)
+        return (jnp.maximum(best, jump), jnp.where(jump > best, both, noise)), None
+
+    start = (jnp.full_like(z, -1.0), jnp.zeros_like(z))
+    return jax.lax.scan(take, start, (jnp.array(ways * gap), jnp.array(aside)))[0]
 
 
 def _over_disc(
@@ -230,6 +243,12 @@ def _over_disc(
 
     zero = jnp.zeros_like(z)
     return jax.lax.scan(add, (zero, zero, zero), jnp.array(disc.cells))[0]
+
+
+def _root(square: Array) -> Array:
+    """Square root, with a gradient of 0 at 0."""
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
 def _padded(values: Array, reach: tuple[int, int], outside: float) -> Array:

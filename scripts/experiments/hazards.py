@@ -6,7 +6,8 @@ FOLDER is a traverse in the simulator's layout, such as `jaxmap simulate` writes
 `shared/simdata`. Prints for each what is within 5 cm of the truth (the Lunar Autonomy Challenge asks for that), root
 mean square, bias, and coverage: the share of the columns with a surface in them that have a height. Rows are the
 middle of the highest voxel; heights whose sigma is below 5 cm, as `map` writes them (surface_m); and those filled from
-0.1 m around, from which hazards are measured. Then the median error of each hazard over all of the rover's discs.
+0.1 m around, from which hazards are measured. Then the median error of each hazard over all of the rover's discs, and
+in how many of them steps bar the rover as they truly do, or do not.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ Worlds of new seeds are rendered into the folder, each once (extra `sim`; minute
 are free in truth, in view, at least 3 m apart, and between which true rock bars the straight way wherever there
 are such pairs. Prints, for each way to see rocks, how many paths were found and how many of them collide: come closer
 to a true rock of more than 0.3 m than the rover's radius; and their length over that of the same planner where it
-knows true heights and all rocks of more than 0.3 m. Rows plane, network and relief plan by what labels say alone; hazards by heights alone; ours by both.
+knows true heights and all rocks of more than 0.3 m. Rows plane, network and relief plan by what labels say alone;
+hazards by heights alone; ours by both.
 """
 
 from __future__ import annotations

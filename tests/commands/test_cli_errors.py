@@ -86,6 +86,8 @@ def trained(given: Given, fault: str, *words: object) -> list[object]:
     return ["train", data, "--out", given.folder / "run", *(TRAIN_FAULTS[fault][1](data, given.folder) or []), *words]
 
 
+ENDS = ("--start", 0, 0, "--goal", 1, 1)
+
 FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "unknown command": (2, lambda given: ["mapp"]),
     "check: no sequence": (1, lambda given: ["check", given.folder / "nowhere"]),
@@ -96,6 +98,8 @@ FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "map: unknown key": (2, lambda given: mapped(given, "--config", config_of(given, "labeler: plane\n"))),
     "map: out of range": (2, lambda given: mapped(given, "--plane.threshold-m", "-1")),
     "evaluate: no run": (1, lambda given: ["evaluate", given.folder / "nowhere", given.folder / "truth.tif"]),
+    "plan: no run": (1, lambda given: ["plan", given.folder / "nowhere", *ENDS]),
+    "plan: unknown rover": (2, lambda given: ["plan", given.run, *ENDS, "--rover", "sparrow"]),
     "export: newer map": (1, lambda given: ["export", newer(given)]),
     "report: no metrics": (1, lambda given: ["report", without_metrics(given)]),
     "demo: out lies in a file": (1, lambda given: ["demo", "--out", below_a_file(given)]),
