@@ -22,6 +22,7 @@ from .labellers.options import DeeplabOptions, PlaneOptions, ReliefOptions
 from .labellers.plane import make_plane_labeller
 from .labellers.relief import combine_with_relief, make_relief_labeller
 from .labels import IGNORE, ROVER_CLASSES
+from .mapping.observations import Observations, open_observations
 from .mapping.sequence import prepare_frames, run_sequence
 from .mapping.step import Mapper, MapperParams, make_mapper
 from .mapping.store import MapAttributes, load_map, save_map
@@ -68,6 +69,7 @@ __all__ = [
     "MapAttributes",
     "Mapper",
     "MapperParams",
+    "Observations",
     "Plane",
     "PlaneOptions",
     "PointCloud",
@@ -114,6 +116,7 @@ __all__ = [
     "make_voxel_map",
     "map_gradient",
     "occupancy_probability",
+    "open_observations",
     "open_sequence",
     "plane_distance",
     "points_to_pixels",

@@ -124,10 +124,10 @@ def pinhole(camera: StereoCamera) -> Pinhole:
 class Frame:
     """One stereo frame, ready for the compiled step.
 
-    `disparity_px` is NaN where the matcher found nothing; `image` is the rectified left one, grey or RGB. The
-    next three are present only where the labeller asks for them, so that every frame of a sequence has the
-    same structure; `pose_errors` are those of the members of an ensemble, where there is one
-    (`ensemble.draws.draw_pose_errors`).
+    `disparity_px` is NaN where the matcher found nothing; `image` is the rectified left one, grey or RGB; `logits`
+    are what a network has made of it, at its own resolution. One of the next four is present where the labeller asks
+    for it, so that every frame of a sequence has the same structure; `pose_errors` are those of the members of an
+    ensemble, where there is one (`ensemble.draws.draw_pose_errors`).
     """
 
     disparity_px: Float[Array, "H W"]
@@ -135,6 +135,7 @@ class Frame:
     image: UInt8[Array, "H W *rgb"] | None = None
     labels: UInt8[Array, "H W"] | None = None
     class_probabilities: Float[Array, "H W C"] | None = None
+    logits: Float[Array, "h w C"] | None = None
     pose_errors: Float[Array, "M 6"] | None = None
 
 

@@ -24,7 +24,7 @@ from jaxmap.commands.main import main as jaxmap_main
 from jaxmap.datasets.samples import sample_truth
 from jaxmap.host.output_folder import write_yaml
 from jaxmap.labels import class_colours
-from jaxmap.report.run_page import RunContents, read_run
+from jaxmap.report.run_contents import RunContents, read_run
 from jaxmap.runs.config import config_tree
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "traverse.png"

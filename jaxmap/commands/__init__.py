@@ -5,6 +5,7 @@ from __future__ import annotations
 COMMANDS: dict[str, str] = {
     "demo": "map the bundled sample with every labeller and compare the scores",
     "check": "say what is wrong with a sequence before it is mapped",
+    "perceive": "match and label every frame once, and keep what was seen",
     "map": "map a stereo sequence",
     "train": "train or fine-tune DeepLabv3+ on images and masks",
     "refine": "refine poses, camera mounting and stereo calibration until frames agree",
@@ -16,6 +17,7 @@ COMMANDS: dict[str, str] = {
     "weights": "convert or download pretrained networks",
     "export": "write a map in another file format",
     "report": "write the HTML report of a run again",
+    "view": "show a run in the viewer of rerun, frame by frame",
     "info": "print versions, devices and folders",
 }
 """Name and one-line help of each command, in the order of `jaxmap --help`."""

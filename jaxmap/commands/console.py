@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import tyro
 
@@ -20,7 +20,11 @@ SHORT = {"--relief": ("--relief.combine", "True"), "--no-relief": ("--relief.com
 
 
 def parse(
-    kind: type[Arguments], command: str, words: Sequence[str], with_config: Callable[[str], Arguments] | None = None
+    kind: type[Arguments],
+    command: str,
+    words: Sequence[str],
+    with_config: Callable[[str], Arguments] | None = None,
+    default: Arguments | None = None,
 ) -> Arguments:
     """Parses the options of a command; exits with status 2 where they are wrong.
 
@@ -29,8 +33,9 @@ def parse(
         command: its name.
         words: the command line after it.
         with_config: returns the defaults under the configuration that `--config` names.
+        default: the defaults, where they are not those of the dataclass.
     """
-    defaults = {}
+    defaults: dict[str, Any] = {} if default is None else {"default": default}
     if with_config is not None and (name := _value_of("--config", words)) is not None:
         defaults["default"] = with_config(name)
     words = [long for word in words for long in SHORT.get(word, (word,))]

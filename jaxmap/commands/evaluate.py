@@ -1,11 +1,11 @@
-"""`jaxmap evaluate`: scores a top-down map against ground truth."""
+"""`jaxmap evaluate`: scores a top-down map, and poses, against ground truth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from annotated_types import Interval
@@ -13,25 +13,30 @@ from annotated_types import Interval
 from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.options import ScoringOptions
-from jaxmap.host.output_folder import check_inputs_stay
+from jaxmap.host.output_folder import check_inputs_stay, write_json
+from jaxmap.host.settings import NotNegative, Positive
 from jaxmap.report.wording import MISSED_COLUMNS, SCORE_COLUMNS
+
+if TYPE_CHECKING:
+    from jaxmap.runs.folder import RunFolder
 
 Diameter = Annotated[float, Interval(gt=0, le=1000)]
 
 
 @dataclass(frozen=True)
 class EvaluateArguments:
-    """Score the top-down map of a run against ground truth.
+    """Score the top-down map of a run against ground truth, or its poses against true ones, or both.
 
     Cells count where the map observed a surface and the truth is labelled; the second row counts every labelled cell
     in the cameras' view, with unobserved ones as not rock. An ensemble (jaxmap map --ensemble.members) is scored by how
     well it predicts the missed cells among those not called rock. Writes scores.json and errors.png (true, false and
-    missed rock in colours) into the run folder and its report, or --out and OUT_errors.png.
+    missed rock in colours) into the run folder and its report, or --out and OUT_errors.png. Of poses: absolute and
+    relative errors (ATE, RPE) as evo counts them, in pose_scores.json, or --out (OUT_poses.json beside scores).
     """
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
-    ground_truth: tyro.conf.Positional[tuple[Path, ...]]
+    ground_truth: tyro.conf.Positional[tuple[Path, ...]] = ()
     """A labelled orthomosaic (GeoTIFF: 0 unlabelled, 1 sand, 2 rock), or text files of rocks (x y [diameter in m]),
     or a folder of those."""
     out: Path | None = None
@@ -49,6 +54,12 @@ class EvaluateArguments:
     """Diameters of small, medium and large rocks in lists that give none."""
     backdrop: Path | None = None
     """An RGB orthomosaic to draw the errors on."""
+    poses: Path | None = None
+    """True poses of the left camera (TUM, KITTI, EuRoC, CSV) to compare the run's with."""
+    max_diff_s: Annotated[float, NotNegative] = 0.01
+    """How far in time a pose and its true one may be apart."""
+    way_m: Annotated[float, Positive] = 1.0
+    """Length of the pieces of the path over which relative errors are taken, beside those from frame to frame."""
 
 
 COLUMNS = {"over": "counted", **SCORE_COLUMNS}
@@ -58,23 +69,40 @@ RANKING_COLUMNS = {"by": "missed, by", **MISSED_COLUMNS}
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(EvaluateArguments, "evaluate", words)
-    if not arguments.ground_truth:
-        raise UsageError("no ground truth", where="the command line", fix="name an orthomosaic or lists of rocks")
+    if not arguments.ground_truth and arguments.poses is None:
+        fix = "name an orthomosaic or lists of rocks, or true poses with --poses"
+        raise UsageError("no ground truth", where="the command line", fix=fix)
     if arguments.out is not None and arguments.out.suffix.lower() != ".json":
         raise UsageError(f"--out {arguments.out} is not a .json file", fix="name a JSON file")
     check_bounds(arguments, "evaluate")
 
-    from jaxmap.datasets.label_raster import choose_coding
-    from jaxmap.datasets.rock_list import SIZE_CLASSES
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.report.run_page import write_report
-    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, read_backdrop, summary, write_evaluation
     from jaxmap.runs.folder import RunFolder
 
     keep_compiled_programs()
     console = Console()
     folder = RunFolder(arguments.run)
     folder.settle_for_reading()
+    written = [*_score_map(arguments, folder, console), *_score_poses(arguments, folder, console)]
+    if arguments.out is None and folder.metrics.is_file():
+        # The scores go into the report; a run that is incomplete has none.
+        try:
+            written.append(write_report(arguments.run))
+        except JaxmapError as error:
+            console.notify(f"note: the report was not written again: {error}")
+    console.result(written[0].parent, [path.name for path in written])
+    return 0
+
+
+def _score_map(arguments: EvaluateArguments, folder: RunFolder, console: Console) -> list[Path]:
+    """Scores the map where there is truth for it, and returns what was written."""
+    from jaxmap.datasets.label_raster import choose_coding
+    from jaxmap.datasets.rock_list import SIZE_CLASSES
+    from jaxmap.runs.evaluation import TruthOptions, evaluate_run, read_backdrop, summary, write_evaluation
+
+    if not arguments.ground_truth:
+        return []
     out, picture = folder.scores, folder.errors
     if arguments.out is not None:
         out, picture = arguments.out, arguments.out.with_name(f"{arguments.out.stem}_errors.png")
@@ -90,15 +118,32 @@ def main(words: Sequence[str]) -> int:
     for note in scores["notes"]:
         console.notify(f"note: {note}")
     _print_scores(console, scores, summary(scores))
-    names = [out.name, picture.name]
-    if arguments.out is None and folder.metrics.is_file():
-        # The scores go into the report; a run that is incomplete has none.
-        try:
-            names.append(write_report(arguments.run).name)
-        except JaxmapError as error:
-            console.notify(f"note: the report was not written again: {error}")
-    console.result(out.parent, names)
-    return 0
+    return [out, picture]
+
+
+def _score_poses(arguments: EvaluateArguments, folder: RunFolder, console: Console) -> list[Path]:
+    """Compares the poses where there are true ones, and returns what was written."""
+    from jaxmap.report.wording import POSE_COLUMNS, pose_rows
+    from jaxmap.runs.pose_evaluation import evaluate_poses
+
+    if arguments.poses is None:
+        return []
+    out = folder.pose_scores
+    if arguments.out is not None:
+        out = arguments.out
+        out = out.with_name(f"{out.stem}_poses.json") if arguments.ground_truth else out
+    check_inputs_stay((out,), (arguments.poses, folder.metrics, folder.poses))
+    scores = evaluate_poses(arguments.run, arguments.poses, arguments.max_diff_s, arguments.way_m)
+    for note in scores["notes"]:
+        console.notify(f"note: {note}")
+    title = (
+        f"{scores['poses']} of {scores['poses_of_run']} poses compared over {scores['path_length_m']:.1f} m; "
+        f"scale {scores['scale']:.5f}"
+    )
+    rows = [{key: _shown(value) for key, value in row.items()} for row in pose_rows(scores)]
+    console.table(title, {"error": "error", **POSE_COLUMNS}, rows)
+    write_json(out, scores)
+    return [out]
 
 
 def _print_scores(console: Console, scores: dict, title: str) -> None:

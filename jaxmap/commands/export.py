@@ -14,15 +14,16 @@ from jaxmap.commands.console import Console, parse
 
 @dataclass(frozen=True)
 class ExportArguments:
-    """Write the map of a run as PLY (occupied voxels), GeoTIFF (top-down map) or PNG.
+    """Write the map of a run as PLY (occupied voxels), GeoTIFF (top-down map) or PNG, or the run for COLMAP.
 
     Where the run has an ensemble, the GeoTIFF holds its layers, and a second PNG shows what the map may have missed.
+    For COLMAP and what reads its models, colmap/ holds cameras.txt, images.txt, points3D.txt and the rectified images.
     """
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
-    format: Literal["ply", "geotiff", "png", "all"] = "all"
-    """What to write."""
+    format: Literal["ply", "geotiff", "png", "colmap", "all"] = "all"
+    """What to write; all are the first three."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -34,6 +35,14 @@ def main(words: Sequence[str]) -> int:
 
     folder = RunFolder(arguments.run)
     folder.settle_for_reading()
+    console = Console()
+    if arguments.format == "colmap":
+        from jaxmap.runs.colmap import export_colmap
+
+        with console.counted("images", "images") as count:
+            written = export_colmap(folder, console.notify, count)
+        console.result(arguments.run, written)
+        return 0
     formats = tuple(EXPORTS) if arguments.format == "all" else (arguments.format,)
-    Console().result(arguments.run, write_exports(folder, open_map(folder.map), formats))
+    console.result(arguments.run, write_exports(folder, open_map(folder.map), formats))
     return 0

@@ -13,7 +13,7 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.memory import restart_with_lasting_memory
 from jaxmap.host.streams import lasting_streams, lost_output
 
-LASTING_MEMORY = ("train", "tune", "segment", "map", "demo")
+LASTING_MEMORY = ("train", "tune", "segment", "perceive", "map", "demo")
 """Commands that allocate and free the memory of a network at every step: gigabytes in training, hundreds of MiB where
 images are labelled. Fetching it anew from the system took a sixth of the time of labelling."""
 

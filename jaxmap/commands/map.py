@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -13,25 +14,26 @@ import tyro
 from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import NotNegative
-from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.config import MapConfig, config_of_observations, load_config, observations_in
 
 OUTPUTS = (
     *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
-    *("config.yaml", "poses.tum", "pictures/"),
+    *("config.yaml", "poses.tum", "frames.csv", "pictures/"),
 )
 
 
 @dataclass(frozen=True)
 class MapArguments:
-    """Map a stereo sequence: images and poses in, a voxel map and its pictures out.
+    """Map a stereo sequence, or what jaxmap perceive has kept of one, into a voxel map and its pictures.
 
-    Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml,
-    poses.tum, pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and
-    bev.tif: the probability of a missed rock.
+    Writes into the run folder: map.zarr, map.ply, bev.tif, bev.png, metrics.json, config.yaml, poses.tum, frames.csv,
+    pictures/ and report.html; with --ensemble.members N also missed.png, and a layer of map.zarr and bev.tif: the
+    probability of a missed rock.
     """
 
     sequence: tyro.conf.Positional[str]
-    """Folder of one sequence, a ROS bag, or sample:motorcycle."""
+    """Folder of one sequence, a ROS bag, or sample:motorcycle; or a folder of observations, whose settings then are the
+    defaults."""
     out: Path
     """The run folder to write; not the sequence's own folder."""
     config: str | None = None
@@ -40,17 +42,27 @@ class MapArguments:
     """Resume an interrupted run."""
     overwrite: bool = False
     """Replace a run that lies in the folder; it stays until the new one is whole."""
+    keep_observations: bool = False
+    """Keep what is perceived on the way as observations.zarr in the run folder, as jaxmap perceive does."""
     checkpoint_every_s: Annotated[float, NotNegative] = 30.0
     """How often the map is saved on the way."""
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
     TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
+    view: bool = False
+    """Show the run in the viewer of rerun while it goes on (pip install 'jaxmap[view]')."""
+    view_save: Path | None = None
+    """Write what --view shows into this .rrd file, and open no window."""
     settings: Annotated[MapConfig, tyro.conf.arg(name="")] = field(default_factory=MapConfig)
 
 
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(MapArguments, "map", words, with_config=_with_config)
+    if (perceived := observations_in(arguments.sequence)) is not None:
+        arguments = parse(MapArguments, "map", words, default=_on(perceived, arguments.config))
+        if arguments.keep_observations:
+            raise UsageError("--keep-observations keeps those of a sequence", where=perceived, fix="leave it out")
     config = arguments.settings
     if arguments.resume and arguments.overwrite:
         raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
@@ -58,22 +70,29 @@ def main(words: Sequence[str]) -> int:
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.report.recording import check_viewer
     from jaxmap.runs.folder import RunFolder
-    from jaxmap.runs.mapping import run_plan
+    from jaxmap.runs.mapping import run_plan, unwatched
     from jaxmap.runs.mapping_plan import plan_run
+    from jaxmap.runs.viewing import live_view
 
+    watched = arguments.view or arguments.view_save is not None
+    if watched:
+        check_viewer(arguments.view_save)
     keep_compiled_programs(scopes=arguments.profile)
     # SIGTERM, which ends jobs of clusters and services, counts as Ctrl-C: the map is saved first.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     folder = RunFolder(arguments.out)
     with console.counted("odometry", "frames") as on_frame:
-        plan = plan_run(arguments.sequence, config, console.notify, on_frame, in_tiles=True)
+        keep = arguments.keep_observations
+        plan = plan_run(arguments.sequence, config, console.notify, on_frame, keep=keep, in_tiles=True)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite
     with (
         folder.locked(),
         folder.writing(plan.settings(config), resume=resume, overwrite=overwrite) as work,
+        live_view(plan, arguments.view_save) if watched else nullcontext(unwatched) as watch,
         console.progress("mapping", len(plan.sequence.frames)) as advance,
     ):
         metrics = run_plan(
@@ -83,13 +102,17 @@ def main(words: Sequence[str]) -> int:
             checkpoint_every_s=arguments.checkpoint_every_s,
             notify=console.notify,
             on_frame=advance,
+            watch=watch,
             profile=arguments.profile,
         )
     console.notify(summary(metrics))
     for skipped in metrics["sequence"]["skipped"]:
         console.notify(f"skipped {skipped['frame']}: {skipped['reason']}")
     missed, profile = ["missed.png"] if config.ensemble.members else [], ["profile/"] if arguments.profile else []
-    console.result(arguments.out, (*OUTPUTS, *missed, *profile))
+    kept = ["observations.zarr"] if keep else []
+    console.result(arguments.out, (*OUTPUTS, *kept, *missed, *profile))
+    if arguments.view_save is not None:
+        console.result(arguments.view_save.parent, [arguments.view_save.name])
     return 0
 
 
@@ -106,3 +129,9 @@ def summary(metrics: dict) -> str:
 def _with_config(name: str) -> MapArguments:
     """The defaults under a configuration; the two required arguments are filled in by the parser."""
     return MapArguments(sequence=tyro.MISSING, out=tyro.MISSING, config=name, settings=load_config(name))
+
+
+def _on(perceived: Path, name: str | None) -> MapArguments:
+    """The defaults of mapping observations, under a configuration or without."""
+    settings = config_of_observations(perceived, name)
+    return MapArguments(sequence=tyro.MISSING, out=tyro.MISSING, config=name, settings=settings)

@@ -29,7 +29,7 @@ class TrainArguments:
     """
 
     data_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")]
-    """Folder of the training data: images and masks, or with --supervision map a sequence."""
+    """Folder of the training data: images and masks, or with --supervision map a sequence or its observations."""
     out: Path
     """The run folder to write."""
     init: Path | None = None

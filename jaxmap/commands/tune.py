@@ -14,7 +14,7 @@ from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
 from jaxmap.host.output_folder import check_inputs_stay
 from jaxmap.host.replacement import Replacement
-from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.config import MapConfig, config_of_observations, load_config, observations_in
 from jaxmap.tuning.options import TuneOptions
 
 
@@ -29,7 +29,7 @@ class TuneArguments:
     """
 
     sequence: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of sequences, or sample:NAME."""
+    """Folders of sequences or of observations (jaxmap perceive), or sample:NAME."""
     ground_truth: tuple[Path, ...]
     """A labelled orthomosaic for each sequence, in the same order (GeoTIFF: 0 unlabelled, 1 sand, 2 rock)."""
     out: Path
@@ -57,6 +57,9 @@ class TuneArguments:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(TuneArguments, "tune", words, with_config=_with_config)
+    if (perceived := next(filter(None, map(observations_in, arguments.sequence)), None)) is not None:
+        settings = config_of_observations(perceived, arguments.config)
+        arguments = parse(TuneArguments, "tune", words, default=_under(settings, arguments.config))
     config, out = arguments.settings, arguments.out
     replacement = Replacement(out.parent, lambda: _outputs(out), out.stem)
     replacement.settle_for_reading()
@@ -148,6 +151,10 @@ def _text(value: float | None) -> str:
 
 def _with_config(name: str) -> TuneArguments:
     """The defaults under a configuration; the required arguments are filled in by the parser."""
+    return _under(load_config(name), name)
+
+
+def _under(settings: MapConfig, name: str | None) -> TuneArguments:
     return TuneArguments(
-        sequence=tyro.MISSING, ground_truth=tyro.MISSING, out=tyro.MISSING, config=name, settings=load_config(name)
+        sequence=tyro.MISSING, ground_truth=tyro.MISSING, out=tyro.MISSING, config=name, settings=settings
     )

@@ -261,7 +261,7 @@ def assemble(
         # All of them: a stride comes after the odometry, which needs every frame.
         seen, notes = tuple(frames[options.start : options.stop]), tuple(all_notes)
         return StereoSequence(frames=seen, T_world_camera=np.tile(np.eye(4), (len(seen), 1, 1)), notes=notes, **common)
-    track = _timed(track, timestamps_s, options)
+    track = timed_track(track, timestamps_s, options)
     assert track.timestamps_s is not None
     T_source_child, has_pose = poses_at(track, timestamps_s, options.max_pose_gap_s)
 
@@ -301,8 +301,8 @@ def assemble(
     )
 
 
-def _timed(track: PoseTrack, timestamps_s: np.ndarray, options: ReadOptions) -> PoseTrack:
-    """The track with times of the frames' unit, and without wild poses."""
+def timed_track(track: PoseTrack, timestamps_s: np.ndarray, options: ReadOptions) -> PoseTrack:
+    """A track with times of the frames' unit, and without wild poses."""
     if track.timestamps_s is None:
         track = with_timestamps(track, timestamps_s)
     if options.poses_time_unit == "auto":

@@ -128,11 +128,12 @@ def remove_strays(target: Path) -> None:
     """Removes temporary files of processes that were killed while writing the same file."""
     for stray in target.parent.glob(f".{glob.escape(target.stem)}.tmp-*{glob.escape(target.suffix)}"):
         process = stray.name.removeprefix(f".{target.stem}.tmp-").removesuffix(target.suffix)
-        if process.isdecimal() and not _is_alive(int(process)):
+        if process.isdecimal() and not is_alive(int(process)):
             stray.unlink(missing_ok=True)
 
 
-def _is_alive(process: int) -> bool:
+def is_alive(process: int) -> bool:
+    """Whether a process of this machine runs."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:

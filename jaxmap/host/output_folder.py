@@ -80,7 +80,7 @@ def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
     except JaxmapError as error:
         raise JaxmapError(error.what, where=error.where, fix="start anew with --overwrite") from error
     before = before if isinstance(before, dict) else {}
-    before, tree = _dotted(before), _dotted(tree)
+    before, tree = dotted(before), dotted(tree)
     differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))
     if differing:
         raise UsageError(
@@ -90,11 +90,11 @@ def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
         )
 
 
-def _dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """A tree of settings flattened to dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
-        flat |= _dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        flat |= dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
 
 

@@ -87,6 +87,15 @@ class Settings(Generic[Config]):
         Raises:
             UsageError: no such file, not YAML, an unknown key, or a value out of range.
         """
+        tree, path = self.read(name_or_path)
+        return self.check(tree, where=path)
+
+    def read(self, name_or_path: str) -> tuple[dict[str, Any], Path]:
+        """The keys and values that such a file names, not yet checked, and its path.
+
+        Raises:
+            UsageError: no such file, or not YAML.
+        """
         from jaxmap.host.bounded_text import read_yaml
 
         path = Path(name_or_path)
@@ -101,7 +110,7 @@ class Settings(Generic[Config]):
             raise UsageError(error.what, where=error.where, fix=error.fix) from error
         if not isinstance(tree or {}, dict):
             raise UsageError(f"holds a {type(tree).__name__}, not keys and values", where=path, fix="write key: value")
-        return self.check({key: value for key, value in (tree or {}).items() if key not in self._given}, where=path)
+        return {key: value for key, value in (tree or {}).items() if key not in self._given}, path
 
     def check(self, tree: dict[str, Any], where: object = "the command line") -> Config:
         """Builds the settings from plain values, strictly.

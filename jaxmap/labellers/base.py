@@ -17,7 +17,7 @@ from jaxmap.geometry.options import GroundOptions
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, PointLabels
 
-Needs = Literal["image", "labels", "class_probabilities"]
+Needs = Literal["image", "labels", "class_probabilities", "logits"]
 """The fields of `Frame` that a labeller may ask for."""
 
 Numbers = dict[str, Float[Array, ""]]
@@ -89,6 +89,8 @@ class Labeller(NamedTuple):
         bijectors: of each tunable number.
         soft: labels are probabilities, which the numbers change smoothly: they can be tuned.
         ground: where it asks for the relief of the cloud, the ground to measure it from.
+        perceive: `(frame, cloud, params) -> logits`, where the labeller sees the image: all that its features take
+            from there. What perceives and what fuses may be apart (`labellers.deeplab.make_logits_labeller`).
     """
 
     name: str
@@ -102,6 +104,7 @@ class Labeller(NamedTuple):
     bijectors: Mapping[str, Bijector] = {}
     soft: bool = False
     ground: GroundOptions | None = None
+    perceive: Callable[[Frame, PointCloud, LabellerParams], Float[Array, "h w C"]] | None = None
 
 
 def label_points(

@@ -20,6 +20,7 @@ from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatur
 from jaxmap.labellers.options import DeeplabOptions
 from jaxmap.labellers.relief import floating_points, ground_seen
 from jaxmap.labels import IGNORE
+from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel
 from jaxmap.models.deeplab import fold_batch_norm, pure_network
 from jaxmap.models.pixelwise import map_pixels, resized_input, upsampling
@@ -84,9 +85,7 @@ def make_deeplab_labeller(
     """Labels by a network that sees the rectified left image inside the step.
 
     The labels are those of `jaxmap segment` with the same model and size; a network that was trained with relief sees
-    that of the frame as well, and leaves out false matches in the air. A pixel's point is kept whatever its class: what
-    the network gives to classes that the map has not is evidence that something is there, and for no class. Logits are
-    divided by the temperature before the softmax (Guo et al. 2017, "On Calibration of Modern Neural Networks").
+    that of the frame as well. What becomes of its logits `make_logits_labeller` says.
 
     Args:
         saved: the network; its batch norm is folded. Its weights become the labeller's params.
@@ -102,27 +101,64 @@ def make_deeplab_labeller(
         raise JaxmapError(
             f"there is only a backbone ({saved.architecture.backbone})", where=_WHERE, fix="train a network from it"
         )
-    mapped = map_classes(saved.architecture.classes, classes, options.class_map)
-    ground = GroundOptions() if saved.architecture.relief_channels and options.see_relief else None
     network = pure_network(*fold_batch_norm(saved.architecture, jax.tree.map(np.asarray, saved.weights)))
+    behind = make_logits_labeller(saved.architecture, classes, options)
+
+    def perceive(frame: Frame, cloud: PointCloud, params: LabellerParams) -> Float[Array, "h w C"]:
+        image, relief = _image(frame), None
+        if behind.ground is not None:
+            assert cloud.relief is not None
+            relief = relief_channels(cloud.relief)[None]
+        with jax.named_scope("network"):
+            return network.apply_coarse(params.weights, resized_input(image[None], options.size_px), relief)[0]
+
+    def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
+        return behind.features(replace(frame, logits=perceive(frame, cloud, params)), cloud, params, key)
+
+    params = LabellerParams(network.weights, behind.params.numbers)
+    return behind._replace(needs="image", features=features, params=params, perceive=perceive)
+
+
+def make_logits_labeller(
+    architecture: Architecture,
+    classes: Sequence[str] | None = None,
+    options: DeeplabOptions | None = None,
+    **changes: Any,
+) -> Labeller:
+    """Labels by what a network has made of the image before: by the frame's logits, at the network's resolution.
+
+    A pixel's point is kept whatever its class: what the network gives to classes that the map has not is evidence that
+    something is there, and for no class. Where the network was shown relief, false matches in the air are left out.
+    Logits are divided by the temperature before the softmax (Guo et al. 2017, "On Calibration of Modern Neural
+    Networks").
+
+    Args:
+        architecture: of the network.
+        classes: the classes of the map (`map_classes`).
+        options: by default those of `DeeplabOptions`; `size_px` and `see_relief` are those that the network ran with.
+        **changes: fields of `DeeplabOptions` that differ from it.
+
+    Raises:
+        JaxmapError: faulty classes, or an option out of bounds.
+    """
+    options = replace(options or DeeplabOptions(), **changes)
+    mapped = map_classes(architecture.classes, classes, options.class_map)
+    ground = GroundOptions() if architecture.relief_channels and options.see_relief else None
     groups = [
         [index for index, target in enumerate(mapped.targets) if target == wanted]
         for wanted in range(len(mapped.classes))
     ]
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
-        image, keep = _image(frame), cloud.in_range.reshape(-1)
-        relief, of_frame = None, ()
+        coarse, image_px, keep = frame.logits, frame.disparity_px.shape, cloud.in_range.reshape(-1)
+        assert coarse is not None
+        of_frame = ()
         if ground is not None:
-            assert cloud.relief is not None
-            of_frame = ground_seen(cloud)
-            relief, keep = relief_channels(cloud.relief)[None], keep & ~floating_points(cloud)
-        with jax.named_scope("network"):
-            coarse = network.apply_coarse(params.weights, resized_input(image[None], options.size_px), relief)[0]
-        places = upsampling(network.architecture, coarse.shape[:2], image.shape[:2], options.size_px)
+            of_frame, keep = ground_seen(cloud), keep & ~floating_points(cloud)
+        places = upsampling(architecture, coarse.shape[:2], image_px, options.size_px)
 
         def map_rows(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
-            more = more if more is None else more.reshape(*image.shape[:2], -1)
+            more = more if more is None else more.reshape(*image_px, -1)
             with jax.named_scope("pixel_labels"):
                 return tuple(image.reshape(-1) for image in map_pixels(function, coarse, places, more))
 
@@ -133,15 +169,14 @@ def make_deeplab_labeller(
             return _merged_softmax(logits / numbers["temperature"], groups)
         return (_likeliest(logits, mapped.targets),)
 
+    numbers = {"temperature": to_device(options.temperature, np.float32)} if options.soft else {}
     return Labeller(
         "deeplab",
         mapped.classes,
-        "image",
+        "logits",
         features,
         label,
-        params=LabellerParams(
-            network.weights, {"temperature": to_device(options.temperature, np.float32)} if options.soft else {}
-        ),
+        params=LabellerParams(numbers=numbers),
         bijectors={"temperature": positive(0.02, 50.0)},
         soft=options.soft,
         ground=ground,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,13 @@ from jax.typing import DTypeLike
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxmap.datasets.base import FrameRef, StereoSequence
-from jaxmap.datasets.images import as_rgb
+from jaxmap.datasets.images import ImageArray, as_rgb, read_image
 from jaxmap.datasets.label_files import LabelFolder
 from jaxmap.errors import FrameError
 from jaxmap.host.prefetch import prefetch
 from jaxmap.host.stages import timed_stage
 from jaxmap.labellers.base import Labeller, Needs
+from jaxmap.mapping.observations import Observation, Observations
 from jaxmap.mapping.step import Mapper, MapperParams, StepCost, StepReport, compile_step
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
 from jaxmap.types import Frame, StereoCamera, VoxelMap, to_device
@@ -59,7 +60,7 @@ def prepare_frames(
     *,
     needs: Needs | None = None,
     pose_errors: Float[np.ndarray, "N M 6"] | None = None,
-    first: int = 0,
+    indices: Sequence[int] | None = None,
     workers: int = 2,
     ahead: int = 4,
 ) -> Iterator[PreparedFrame]:
@@ -72,7 +73,7 @@ def prepare_frames(
         needs: what the labeller asks of each frame (`Labeller.needs`); the rectified left image is delivered,
             as RGB, where it is `image`.
         pose_errors: of the members of an ensemble, for each frame.
-        first: index of the first frame.
+        indices: which frames; by default all.
         workers: threads.
         ahead: frames in the making or waiting, which bounds the memory.
 
@@ -104,7 +105,66 @@ def prepare_frames(
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)
 
-    return _in_right_order(prefetch(prepare, range(first, len(sequence.frames)), workers, ahead), front_end)
+    chosen = range(len(sequence.frames)) if indices is None else indices
+    return _in_right_order(prefetch(prepare, chosen, workers, ahead), front_end)
+
+
+def observed_frames(
+    observations: Observations,
+    *,
+    left_image: Callable[[FrameRef], ImageArray] | None = None,
+    pose_errors: Float[np.ndarray, "N M 6"] | None = None,
+    first: int = 0,
+    workers: int = 2,
+    ahead: int = 4,
+) -> Iterator[PreparedFrame]:
+    """The frames of observations, read ahead of their use: what `prepare_frames` is to the images of a sequence.
+
+    Args:
+        observations: the frames and their poses.
+        left_image: reads the rectified left image of a frame, which is then delivered, as RGB, in place of the labels
+            that are kept.
+        pose_errors: of the members of an ensemble, for each frame.
+        first: index of the first frame.
+        workers: threads.
+        ahead: frames in the making or waiting.
+    """
+
+    def prepare(index: int) -> PreparedFrame:
+        ref, stages_s = observations.frames[index], {}
+        try:
+            with timed_stage("read", stages_s):
+                seen = observations.observation(index)
+                prepared = as_prepared(observations, seen, index, pose_errors)
+                picture, left = observations.picture(index), None
+                if left_image is not None:
+                    left = left_image(ref)
+                elif picture is not None:
+                    left = read_image(picture)
+        except FrameError as fault:
+            return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
+        assert prepared.rectified is not None and prepared.frame is not None
+        frame, rectified = prepared.frame, prepared.rectified
+        if left is not None:
+            rectified = rectified._replace(left=left)
+        if left is not None and left_image is not None:
+            kept: dict[str, Any] = dict.fromkeys(get_args(Needs))
+            frame = replace(frame, **kept | {"image": to_device(as_rgb(left))})
+        return replace(prepared, frame=frame, rectified=rectified, stages_s=stages_s)
+
+    return prefetch(prepare, range(first, len(observations.frames)), workers, ahead)
+
+
+def as_prepared(
+    observations: Observations, seen: Observation, index: int, pose_errors: Float[np.ndarray, "N M 6"] | None = None
+) -> PreparedFrame:
+    """An observation as a frame for the step; its rectified images are empty."""
+    frame = observations.frame_of(seen, index)
+    if pose_errors is not None:
+        frame = replace(frame, pose_errors=to_device(pose_errors[index], np.float32))
+    nothing = np.zeros((0, 0), np.uint8)
+    rectified = RectifiedFrame(nothing, nothing, seen.disparity_px, 0.0, 0.0, seen.too_near, seen.nearest_px)
+    return PreparedFrame(index, observations.frames[index], frame, rectified)
 
 
 def _in_right_order(frames: Iterator[PreparedFrame], front_end: StereoFrontEnd) -> Iterator[PreparedFrame]:
@@ -117,19 +177,21 @@ def _in_right_order(frames: Iterator[PreparedFrame], front_end: StereoFrontEnd) 
         yield prepared
 
 
-def frame_form(camera: StereoCamera, labeller: Labeller, members: int = 0) -> Frame:
+def frame_form(camera: StereoCamera, labeller: Labeller, members: int = 0, logits_shape: tuple[int, ...] = ()) -> Frame:
     """The form of the frames that `prepare_frames` makes for a labeller: shapes without numbers.
 
     Args:
         camera: the rectified camera.
         labeller: what asks for images, labels or probabilities.
         members: of an ensemble.
+        logits_shape: of the logits, where the labeller asks for those (`ObservationAttributes.kept_shape`).
     """
     size = (camera.height_px, camera.width_px)
     kinds: dict[Needs, tuple[tuple[int, ...], DTypeLike]] = {
         "image": ((*size, 3), np.uint8),
         "labels": (size, np.uint8),
         "class_probabilities": ((*size, len(labeller.classes)), np.float32),
+        "logits": (logits_shape, np.float32),
     }
 
     def frame() -> Frame:

@@ -136,6 +136,22 @@ def fuse_frame(
 
 
 @in_full_float32
+def perceive_frame(
+    labeller: Labeller,
+    camera: StereoCamera,
+    frame: Frame,
+    params: LabellerParams,
+    disparity_sigma_px: Float[Array, ""] | float,
+) -> Float[Array, "h w C"]:
+    """What the network of a labeller makes of a frame within the step: its `perceive`, apart from the fusion."""
+    assert labeller.perceive is not None
+    depths_m = (0.0, float("inf"))
+    pose = frame.T_world_camera
+    cloud = project(camera, pose, frame.disparity_px, depths_m, disparity_sigma_px, labeller.ground)
+    return labeller.perceive(frame, cloud, params)
+
+
+@in_full_float32
 def label_image(
     design: StepDesign, frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]
 ) -> UInt8[Array, "H W"]:

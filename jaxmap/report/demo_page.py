@@ -14,9 +14,10 @@ from jaxtyping import UInt8
 from jaxmap.evaluation.evaluate import Evaluation
 from jaxmap.fusion.query import TopDown, top_down
 from jaxmap.labels import class_colours
+from jaxmap.report.drive_view import drive_section
 from jaxmap.report.error_map import verdict_colours, write_error_map, write_truth_map
 from jaxmap.report.page import figure, header, inline_image, section, table, write_page
-from jaxmap.report.run_page import RunContents, in_3d, key_frame_row, read_run
+from jaxmap.report.run_contents import RunContents, read_run
 from jaxmap.report.top_down import HALF, UNOBSERVED_COLOUR, map_sheet, top_down_picture
 
 Row = Mapping[str, Any]
@@ -64,12 +65,9 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
     above += _picture(out / "truth.png", "Ground truth", "Orthomosaic, at another time of day, with the true rocks")
     classes = shown.voxel_map.classes
     there = {name: class_colours(classes)[index] for index, name in enumerate(classes) if (top.label == index).any()}
-    frames = list(shown.pictures)
-    saw = key_frame_row(shown, frames[len(frames) // 3]) if frames else ""
     bodies = [
         _head(title, columns, shown, last.row),
-        section("What the rover saw", saw),
-        in_3d(shown),
+        drive_section(shown),
         section(
             "Map and ground truth",
             _legend(there | {"not observed": UNOBSERVED_COLOUR}) + f'<div class="pairs">{above}</div>',

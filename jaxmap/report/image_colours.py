@@ -47,8 +47,9 @@ def image_colours(points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenF
     colours = np.zeros((len(points_world), 3))
     nearest_m = np.full(len(points_world), np.inf)
     for frame in frames:
-        depth_m, column, row = _projected(points_world, frame)
-        seen = _unhidden(depth_m, column, row, frame.image.shape[:2]) & (depth_m < nearest_m)
+        size = frame.image.shape[:2]
+        depth_m, column, row = project_points(points_world, frame.T_world_camera, frame.focal_px, frame.centre_px, size)
+        seen = unhidden(depth_m, column, row, size) & (depth_m < nearest_m)
         # Blurred, as a voxel covers more than a pixel.
         smooth = np.asarray(Image.fromarray(frame.image).convert("RGB").filter(ImageFilter.BoxBlur(2)))
         colours[seen] = smooth[row[seen], column[seen]]
@@ -61,23 +62,32 @@ def image_colours(points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenF
     return np.rint(colours.clip(0, 255)).astype(np.uint8)
 
 
-def _projected(points_world: np.ndarray, frame: SeenFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth of points, and the pixel they fall into; the depth is infinite outside the image."""
-    x, y, z = ((points_world - frame.T_world_camera[:3, 3]) @ frame.T_world_camera[:3, :3]).T
+def project_points(
+    points_world: Float[np.ndarray, "N 3"],
+    T_world_camera: Float64[np.ndarray, "4 4"],
+    focal_px: tuple[float, float],
+    centre_px: tuple[float, float],
+    size: tuple[int, ...],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth of points, and column and row of the pixel they fall into; the depth is infinite outside the image.
+
+    `size` is height and width of the image.
+    """
+    x, y, z = ((points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
     ahead = z > 0.05
     depth_m = np.where(ahead, z, 1.0)
     column, row = (
         np.floor(focal * side / depth_m + centre + 0.5)
-        for focal, centre, side in zip(frame.focal_px, frame.centre_px, (x, y), strict=True)
+        for focal, centre, side in zip(focal_px, centre_px, (x, y), strict=True)
     )
-    height, width = frame.image.shape[:2]
+    height, width = size
     inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row = (np.where(inside, index, 0).astype(int) for index in (column, row))
     return np.where(inside, depth_m, np.inf), column, row
 
 
-def _unhidden(depth_m: np.ndarray, column: np.ndarray, row: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Points in the image with none well before them."""
+def unhidden(depth_m: np.ndarray, column: np.ndarray, row: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Points in the image (of `project_points`) with none well before them in the same block of pixels."""
     block = row // _BLOCK_PX, column // _BLOCK_PX
     nearest_m = np.full((-(-size[0] // _BLOCK_PX), -(-size[1] // _BLOCK_PX)), np.inf)
     np.minimum.at(nearest_m, block, depth_m)

@@ -39,15 +39,16 @@ def page(title: str, body: str, *, drawn: bool) -> str:
         from plotly.offline import get_plotlyjs
 
         scripts = f"<script>{get_plotlyjs()}</script>"
-    style, script = (
-        files("jaxmap.report").joinpath(f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js")
+    style, *code = (
+        files("jaxmap.report").joinpath(name).read_text(encoding="utf-8")
+        for name in ("page.css", "page.js", "drive.js")
     )
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)} · jaxmap</title>\n<style>{style}</style>\n</head>\n"
-        f"<body>\n<main>{body}</main>\n{scripts}\n<script>{script}</script>\n</body>\n</html>\n"
+        f"<body>\n<main>{body}</main>\n{scripts}\n<script>{''.join(code)}</script>\n</body>\n</html>\n"
     )
 
 
@@ -121,8 +122,8 @@ def inline_image(path: Path, alt: str, *, width_px: int | None = None) -> str:
     try:
         with open_picture(path) as picture:
             picture.load()
-            content, kind, image = path.read_bytes(), "png", picture
-            if width_px is not None:
+            content, kind, image = path.read_bytes(), str(picture.format).lower(), picture
+            if width_px is not None and (kind != "webp" or picture.width > width_px):
                 image = picture.convert("RGB")
                 image.thumbnail((width_px, width_px * 4))
                 buffer = io.BytesIO()

@@ -2,53 +2,23 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxmap.datasets.poses import read_poses
-from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
-from jaxmap.fusion.params import FusionParams, FusionRule, stored_fusion
-from jaxmap.host.bounded_text import YAML_BOUNDS, read_json, read_text
-from jaxmap.host.pictures import open_picture
+from jaxmap.errors import JaxmapError
+from jaxmap.host.bounded_text import YAML_BOUNDS, read_text
 from jaxmap.labels import class_colours
-from jaxmap.mapping.store import MapAttributes, load_map
-from jaxmap.report.image_colours import SeenFrame, image_colours
-from jaxmap.report.page import (
-    figure,
-    header,
-    inline_image,
-    notes_section,
-    paper,
-    script_text,
-    section,
-    table,
-    write_page,
-)
-from jaxmap.report.voxel_view import voxel_view
-from jaxmap.report.wording import (
-    MISSED_COLUMNS,
-    SCORE_COLUMNS,
-    name_and_unit,
-    number_text,
-    share_text,
-    value_text,
-)
-from jaxmap.types import VoxelMap
+from jaxmap.report.drive_view import drive_section
+from jaxmap.report.page import figure, header, notes_section, paper, section, table, write_page
+from jaxmap.report.run_contents import RunContents, read_run
+from jaxmap.report.score_tables import map_score_section, pose_score_section
+from jaxmap.report.wording import name_and_unit, number_text, share_text, value_text
 
-MAX_KEY_FRAMES = 12
-PICTURE_WIDTH_PX = 720
-
-_CAPTIONS = {"left": "Left image", "disparity": "Disparity, near red to far blue", "labels": "Labels"}
-_PICTURE_NAME = re.compile(rf"(?P<frame>.+)_(?P<kind>{'|'.join(_CAPTIONS)})\.png")
 _FILES = {
     "map.zarr": "the map, Zarr",
     "map.ply": "occupied voxels, point cloud",
@@ -56,83 +26,15 @@ _FILES = {
     "bev.png": "top-down map, picture",
     "missed.png": "where the map may have missed something, picture",
     "poses.tum": "poses of the left camera",
+    "frames.csv": "what became of each frame",
     "metrics.json": "all numbers of this page",
     "config.yaml": "the configuration",
     "scores.json": "scores against ground truth",
+    "pose_scores.json": "errors of the poses",
     "errors.png": "where map and ground truth differ, picture",
 }
 _GROUPS = ("camera", "grid", "times", "points", "voxels", "ensemble", "memory", "sequence")
 _ELSEWHERE = {"skipped", "notes", "stages", "by_class", "key_frames"}
-
-
-@dataclass(frozen=True)
-class RunContents:
-    """What a run left in its folder.
-
-    Attributes:
-        path: the folder.
-        voxel_map: the map, with its attributes.
-        params: of fusion, by which the map is read.
-        rule: of fusion, likewise.
-        voxels: the occupied ones.
-        metrics: the content of `metrics.json`.
-        trajectory_world: positions of the left camera in the map's world, None without `poses.tum`.
-        pictures: paths by kind (left, disparity, labels), by the number of their key frame.
-        remarks: what could not be read.
-    """
-
-    path: Path
-    voxel_map: VoxelMap
-    attributes: MapAttributes
-    params: FusionParams
-    rule: FusionRule
-    voxels: OccupiedVoxels
-    metrics: dict[str, Any]
-    trajectory_world: Float[np.ndarray, "N 3"] | None
-    pictures: dict[str, dict[str, Path]]
-    remarks: list[str]
-
-    @property
-    def name(self) -> str:
-        """That of the sequence, or else of the folder."""
-        return str(self.group("sequence").get("name") or self.path.resolve().name)
-
-    def group(self, key: str) -> dict[str, Any]:
-        """A group of metrics; empty where it is absent or no group."""
-        value = self.metrics.get(key)
-        return value if isinstance(value, dict) else {}
-
-
-def read_run(run: Path) -> RunContents:
-    """Reads a run folder.
-
-    Raises:
-        JaxmapError: the map or the metrics are missing or broken.
-    """
-    run = Path(run)
-    if not run.is_dir():
-        raise JaxmapError("no such run folder", where=run, fix="give a folder that `jaxmap map` wrote")
-    voxel_map, attributes = load_map(run / "map.zarr")
-    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, run / "map.zarr")
-    path, fix = run / "metrics.json", "finish the run (jaxmap map ... --resume), or bring the file back"
-    try:
-        metrics = read_json(path)
-    except JaxmapError as error:
-        raise JaxmapError(error.what, where=error.where, fix=fix) from error
-    if not isinstance(metrics, dict):
-        raise JaxmapError("not a JSON object", where=path, fix=fix)
-    trajectory_world, remarks = None, []
-    if (run / "poses.tum").is_file():
-        try:
-            trajectory_world = read_poses(run / "poses.tum").T[:, :3, 3] - attributes.site_origin
-        except JaxmapError:
-            remarks.append("poses.tum could not be read: the path is left out.")
-    pictures: dict[str, dict[str, Path]] = {}
-    for picture in sorted((run / "pictures").glob("*.png")):
-        if match := _PICTURE_NAME.fullmatch(picture.name):
-            pictures.setdefault(match["frame"], {})[match["kind"]] = picture
-    voxels = occupied_voxels(voxel_map, params, rule)
-    return RunContents(run, voxel_map, attributes, params, rule, voxels, metrics, trajectory_world, pictures, remarks)
 
 
 def write_report(run: Path) -> Path:
@@ -161,11 +63,11 @@ def write_report(run: Path) -> Path:
     )
     body = [
         _header(contents),
+        drive_section(contents),
         section("Top-down map", paper(path / "bev.png", f"Top-down map of {contents.name}", remarks)),
         missed_section(path, metrics, remarks),
-        _score_section(path, remarks),
-        in_3d(contents),
-        section("Key frames", _key_frames(contents)),
+        map_score_section(path, remarks),
+        pose_score_section(path, remarks),
         section("Metrics", _metric_tables(contents)),
         section("Skipped frames", f'<div class="list">{table((), rows, "plain")}</div>' if rows else ""),
         notes_section([*(notes if isinstance(notes, list) else []), *remarks]),
@@ -238,118 +140,6 @@ def missed_section(path: Path, metrics: dict[str, Any], remarks: list[str]) -> s
         f"beside {area['called']} called so."
     )
     return section("What may be missed", f"<p>{text}</p>{image}" if image else "")
-
-
-def _score_section(run: Path, remarks: list[str]) -> str:
-    """Scores and error map that `jaxmap evaluate` left in a run folder."""
-    if not (run / "scores.json").is_file():
-        return ""
-    try:
-        text = _scores(read_json(run / "scores.json"))
-    except (JaxmapError, ValueError, KeyError, TypeError, AttributeError):
-        remarks.append("scores.json could not be read: the scores are left out.")
-        return ""
-    image = paper(run / "errors.png", "Rock that was found, falsely called and missed", remarks)
-    return section("Against ground truth", text + image)
-
-
-def _scores(scores: dict[str, Any]) -> str:
-    def listed(title: str, columns: Iterable[tuple[str, str]], rows: Iterable[tuple[str, dict[str, Any]]]) -> str:
-        keys, headings = zip(*columns, strict=True)
-        cells = [(escape(name), *(value_text(values.get(key)) for key in keys)) for name, values in rows]
-        return f'<div class="tables"><figure>{table((title, *headings), cells)}</figure></div>'
-
-    rocks = scores.get("rocks") or {}
-    facts = {"cells": scores.get("cells"), "frames": scores.get("frames")}
-    facts |= {"rocks in view": rocks.get("count"), "of them missed": rocks.get("missed")}
-    size, reach = scores.get("cell_size_m"), scores.get("max_range_m")
-    within = f", within {value_text(reach, 'm')}" if reach is not None else ""
-    counted = ", ".join(f"{value_text(value)} {name}" for name, value in facts.items() if value is not None)
-    rows = [("observed cells", scores), ("all cells in view", scores["in_view"])]
-    if "registration" in scores:
-        rows.append(("observed, before registration", scores["registration"]["before"]))
-    html = (
-        f"<p>Scored for {escape(str(scores.get('class')))} in cells of {value_text(size, 'm')}{within}: {counted}.</p>"
-        + listed("Counted", SCORE_COLUMNS.items(), rows)
-    )
-    if "ensemble" in scores:
-        ensemble = scores["ensemble"]
-        bins = [(f"{number_text(row['from'])} to {number_text(row['to'])}", row) for row in ensemble["reliability"]]
-        html += (
-            f"<p>Of {value_text(ensemble['cells'])} cells that the map does not call so, "
-            f"{value_text(ensemble['missed_cells'])} are; the ensemble expected "
-            f"{value_text(float(ensemble['expected_missed_cells']))}.</p>"
-        )
-        ranked = [("the ensemble", ensemble), ("the map alone", ensemble["map_alone"])]
-        html += listed("Missed cells, by", MISSED_COLUMNS.items(), ranked)
-        columns = {"cells": "cells", "said": "mean", "true": "truly missed"}
-        html += listed("Probability of a miss", columns.items(), bins)
-    return html
-
-
-def in_3d(contents: RunContents) -> str:
-    """The section with the interactive view; a page holds one at most."""
-    if not len(contents.voxels.label):
-        return section("In 3D", "<p>No voxel is occupied.</p>")
-    seen = seen_frames(contents)
-    view = voxel_view(
-        contents.voxels,
-        contents.voxel_map.classes,
-        contents.trajectory_world,
-        (lambda points_world: image_colours(points_world, seen)) if seen else None,
-    )
-    return section(
-        "In 3D",
-        '<div id="view3d" class="view3d" role="figure" '
-        f'aria-label="Occupied voxels of {escape(contents.name)} in 3D, to turn by dragging"></div>'
-        f"<p>{escape(view.caption)} Drag to turn, scroll to zoom.</p>"
-        f'<script type="application/json" id="view3d-data">{script_text(str(view.figure.to_json()))}</script>',
-    )
-
-
-def seen_frames(contents: RunContents) -> list[SeenFrame]:
-    """The key frames with their cameras; those that are not whole are left out."""
-    frames, camera = [], contents.group("camera")
-    poses = camera.get("key_frames")
-    for name, pose in poses.items() if isinstance(poses, dict) else ():
-        try:
-            with open_picture(contents.pictures[name]["left"]) as image:
-                pixels = np.asarray(image)
-            frames.append(
-                SeenFrame(
-                    pixels,
-                    np.array(pose, np.float64).reshape(4, 4),
-                    (camera["fx_px"], camera["fy_px"]),
-                    (camera["cx_px"], camera["cy_px"]),
-                )
-            )
-        except (FrameError, KeyError, ValueError, TypeError):
-            continue
-    return frames
-
-
-def key_frame_row(contents: RunContents, frame: str) -> str:
-    """The pictures of a key frame side by side; those that cannot be read are left out with a remark."""
-    figures = ""
-    for kind, caption in _CAPTIONS.items():
-        if path := contents.pictures[frame].get(kind):
-            try:
-                figures += figure(inline_image(path, f"{caption}, frame {frame}", width_px=PICTURE_WIDTH_PX), caption)
-            except JaxmapError:
-                contents.remarks.append(f"pictures/{path.name} could not be read and is left out.")
-    return f'<div class="row">{figures}</div>' if figures else ""
-
-
-def _key_frames(contents: RunContents) -> str:
-    frames = list(contents.pictures)
-    if len(frames) > MAX_KEY_FRAMES:
-        frames = [frames[i] for i in np.linspace(0, len(frames) - 1, MAX_KEY_FRAMES).round().astype(int)]
-    rows = {frame: row for frame in frames if (row := key_frame_row(contents, frame))}
-    if not rows:
-        return ""
-    shown = "".join(f'<div class="frame"><h3>Frame {escape(frame)}</h3>{row}</div>' for frame, row in rows.items())
-    more = f"<p>{len(rows)} of {len(contents.pictures)} key frames.</p>" if len(rows) < len(contents.pictures) else ""
-    return f'<div class="frames">{shown}</div>{more}'
 
 
 def _metric_tables(contents: RunContents) -> str:

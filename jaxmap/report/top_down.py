@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 INK, FAINT, CASING = "#23272e", "#8a8f98", "#ffffff"
 UNOBSERVED_COLOUR = (241, 240, 236)
 DPI = 150
+PLACE_KEY = "jaxmap-place"
+"""A text in each PNG of a map: where the map lies on the picture, and what it shows."""
+PLACE = ("left_px", "top_px", "width_px", "height_px", "west_m", "south_m", "east_m", "north_m")
+"""Its entries; metres are relative to the site origin."""
 _LEFT_PX, _RIGHT_PX, _BELOW_PX = 150, 50, 130
 _TEXT, _SMALL = 12, 11
 
@@ -131,9 +136,8 @@ def draw(
     height = map_height + _BELOW_PX + legend_px + (84 if title else 40)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     left = _LEFT_PX + (width - _LEFT_PX - _RIGHT_PX - map_width) // 2
-    place = (left / width, (legend_px + _BELOW_PX) / height, map_width / width, map_height / height)
-
-    axes = figure.add_axes(place, facecolor=np.array(UNOBSERVED_COLOUR) / 255)
+    axes_at = (left / width, (legend_px + _BELOW_PX) / height, map_width / width, map_height / height)
+    axes = figure.add_axes(axes_at, facecolor=np.array(UNOBSERVED_COLOUR) / 255)
     extent = (sheet.origin_m[0], end_m[0], sheet.origin_m[1], end_m[1])
     picture = sheet.colours.transpose(1, 0, 2)
     axes.imshow(picture, origin="lower", extent=extent, interpolation="nearest", aspect="auto")
@@ -154,8 +158,7 @@ def draw(
     if overlay is not None:
         overlay(axes)
     axes.text(0.5, 0.5, sheet.remark, ha="center", va="center", transform=axes.transAxes, color=FAINT)
-    title_at = (_LEFT_PX / width, 1 - 42 / height)
-    figure.text(*title_at, title, size=13, weight="bold", va="center", color=INK)
+    figure.text(_LEFT_PX / width, 1 - 42 / height, title, size=13, weight="bold", va="center", color=INK)
 
     spacing: dict[str, Any] = dict(handlelength=1.1, handleheight=1.1, columnspacing=1.6, borderaxespad=0, borderpad=0)
     anchor: dict[str, Any] = dict(
@@ -166,8 +169,10 @@ def draw(
     _draw_scale(axes, (width - _RIGHT_PX, scale_px), _nice(0.11 * map_width / px_per_m), north=sheet.georeferenced)
     if sheet.bar:
         _draw_bar(figure.add_axes((_LEFT_PX / width, 54 / height, 400 / width, 18 / height)), sheet.bar)
+    edges_px = (left, height - legend_px - _BELOW_PX - map_height, map_width, map_height)
+    place = dict(zip(PLACE, (*edges_px, *low_m.tolist(), *high_m.tolist()), strict=True))
     with atomic_path(path) as temporary:
-        FigureCanvasAgg(figure).print_png(temporary)
+        FigureCanvasAgg(figure).print_png(temporary, metadata={PLACE_KEY: json.dumps(place)})
 
 
 def _legend(sheet: Sheet) -> tuple[list[Any], list[str]]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from html import escape
+from typing import Any
 
 _THIN = "\N{NARROW NO-BREAK SPACE}"
 _UNITS = {"m": "m", "px": "px", "ms": "ms", "s": "s", "mib": "MiB", "deg": "°"}
@@ -33,6 +35,9 @@ SCORE_COLUMNS = {
     "ece": "ECE",
 }
 """Headings of the scores of a map, by their keys (DESIGN: Scores JSON)."""
+
+POSE_COLUMNS = {name: name for name in ("rmse", "mean", "median", "std", "min", "max", "count")}
+"""Headings of the errors of poses, by their keys in `evaluation.pose_errors.pose_scores`."""
 
 MISSED_COLUMNS = {
     "auc": "ROC AUC",
@@ -89,3 +94,21 @@ def _sentence(words: list[str]) -> str:
     if text in _NAMES:
         return _NAMES[text]
     return text[:1].upper() + text[1:]
+
+
+def pose_rows(scores: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The errors of poses as rows of a table: what each is of (`error`), and `POSE_COLUMNS`, None where unknown."""
+    piece = f"over {scores['way_m']:g} m of the path"
+    named = {
+        "ate_m": "ATE, m, as they are",
+        "ate_aligned_m": "ATE, m, aligned",
+        "ate_scaled_m": "ATE, m, aligned with scale",
+        "rpe_frame_m": "RPE, m, from frame to frame",
+        "rpe_frame_deg": "RPE, deg, from frame to frame",
+        "rpe_way_m": f"RPE, m, {piece}",
+        "rpe_way_deg": f"RPE, deg, {piece}",
+    }
+    return [
+        {"error": name, **{column: (scores[key] or {}).get(column) for column in POSE_COLUMNS}}
+        for key, name in named.items()
+    ]

@@ -31,9 +31,12 @@ from jaxmap.mapping.store import MapReader, holds_map, load_map, stray_maps
 from jaxmap.planning.ground import absolute_layers
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
 from jaxmap.report.top_down import missed_picture, top_down_picture
+from jaxmap.runs.config import OBSERVATIONS
 from jaxmap.stereo.front_end import RectifiedFrame
 
-_PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.png")
+_PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.(png|webp)")
+_SMALL_PX = 640
+"""Width of the pictures of most key frames: a page holds two dozen of them."""
 
 
 class RunFolder:
@@ -43,6 +46,7 @@ class RunFolder:
         """Names the files; nothing is read or written yet."""
         self.path = path
         self.map = path / "map.zarr"
+        self.observations = path / OBSERVATIONS
         self.ply = path / "map.ply"
         self.geotiff = path / "bev.tif"
         self.picture = path / "bev.png"
@@ -50,8 +54,10 @@ class RunFolder:
         self.metrics = path / "metrics.json"
         self.config = path / "config.yaml"
         self.poses = path / "poses.tum"
+        self.frames = path / "frames.csv"
         self.scores = path / "scores.json"
         self.errors = path / "errors.png"
+        self.pose_scores = path / "pose_scores.json"
         self.pictures = path / "pictures"
         self.profile = path / "profile"
         self._replacement = Replacement(path, self._outputs)
@@ -86,7 +92,7 @@ class RunFolder:
         self.settle()
         replacing = RunFolder(self._replacement.new)
         # A run that has failed before its first save has left nothing to lose.
-        used = holds_map(self.map) or self.metrics.exists()
+        used = holds_map(self.map) or self.metrics.exists() or self.observations.exists()
         if resume and (replacing.config.exists() or used):
             work = replacing if replacing.config.exists() else self
             check_same_settings(work.config, dict(settings))
@@ -117,9 +123,9 @@ class RunFolder:
     def _files(self) -> tuple[Path, ...]:
         report = self.path / "report.html"
         # Scores are of the map that is there: they go with it.
-        scored = (self.scores, self.errors)
+        scored = (self.scores, self.errors, self.pose_scores)
         derived = (self.ply, self.geotiff, self.picture, self.missed)
-        return (*derived, self.metrics, self.poses, report, self.config, *scored)
+        return (*derived, self.metrics, self.poses, self.frames, report, self.config, *scored)
 
     def check_apart(self, source: str, images: Iterable[Path], inputs: Iterable[Path | None]) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
@@ -132,9 +138,10 @@ class RunFolder:
         Raises:
             UsageError: the folder is the sequence's own, or an output would overwrite an input.
         """
-        here = real_path(self.path)
+        here, read = real_path(self.path), real_path(source)
         folders = {real_path(folder) for folder in {image.parent for image in images}}
-        if here == real_path(source) or not folders.isdisjoint((here, *here.parents)):
+        own = here == read or (read.name == OBSERVATIONS and here == read.parent)
+        if own or not folders.isdisjoint((here, *here.parents)):
             raise UsageError("the run folder is the sequence's own", where=self.path, fix="choose another --out")
         check_inputs_stay(self._files, inputs)
 
@@ -163,8 +170,8 @@ class RunFolder:
 
     def _outputs(self) -> Iterator[Path]:
         """What an earlier run has written, and nothing else."""
-        yield from (self.map, *stray_maps(self.map), self.profile, *self._files)
-        for picture in self.pictures.glob("*.png"):
+        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, *self._files)
+        for picture in self.pictures.glob("*"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 yield picture
 
@@ -187,18 +194,32 @@ def write_poses(
 
 
 def write_key_frame(
-    folder: RunFolder, index: int, rectified: RectifiedFrame, labels: np.ndarray | None, classes: tuple[str, ...]
+    folder: RunFolder,
+    index: int,
+    rectified: RectifiedFrame,
+    labels: np.ndarray | None,
+    classes: tuple[str, ...],
+    *,
+    large: bool,
 ) -> None:
-    """Writes the pictures of one frame: left image, disparity and, where there are any, labels."""
+    """Writes the pictures of one frame: left image, disparity and, where there are any, labels.
+
+    Large ones are PNG of the image's own size, others small WebP.
+    """
     from PIL import Image
 
     pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
     for kind, picture in pictures.items():
-        with atomic_path(folder.pictures / f"{index:06d}_{kind}.png") as temporary:
+        image, ending = Image.fromarray(picture), "png"
+        effort: dict[str, Any] = dict(compress_level=1)
+        if not large:
+            image.thumbnail((_SMALL_PX, _SMALL_PX))
+            ending, effort = "webp", dict(quality=80)
+        with atomic_path(folder.pictures / f"{index:06d}_{kind}.{ending}") as temporary:
             # Noise does not compress: more effort takes four times as long and saves little.
-            Image.fromarray(picture).save(temporary, compress_level=1)
+            image.save(temporary, **effort)
 
 
 EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.png"}

@@ -24,13 +24,15 @@ from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.files import bundled
 from jaxmap.host.prefetch import prefetch
 from jaxmap.labels import IGNORE
-from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import MapperParams
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel, load_network
 from jaxmap.models.deeplab import Weights, fold_batch_norm
+from jaxmap.runs.config import observations_in
 from jaxmap.runs.evaluation import class_layer_of
-from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
+from jaxmap.runs.labelling import Notify
+from jaxmap.runs.mapping_plan import Plan, plan_run
+from jaxmap.runs.perception import settings_taken_over
 from jaxmap.runs.segmentation import Segmenter
 from jaxmap.runs.training_plan import SupervisedMapConfig, TrainConfig, TrainingPlan, describe_network
 from jaxmap.training.batches import BATCHES_AHEAD, ExampleOrder
@@ -244,7 +246,7 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
     """Reads the sequence and the orthomosaic, prepares all frames once, and builds network and step.
 
     Args:
-        source: the folder of one sequence, or `sample:NAME`.
+        source: the folder of one sequence or of observations, or `sample:NAME`.
         config: the settings.
         init: model file of the network to start from; the bundled one by default.
         notify: takes lines for the user.
@@ -265,8 +267,10 @@ def plan_map_training(source: str, config: TrainConfig, init: Path | None, *, no
             fix="train it on images first, and leave --classes, network and norm as they are there",
         )
     mapping = replace(config.mapping, model=path, classes=config.classes)
+    if (perceived := observations_in(source)) is not None:
+        mapping = settings_taken_over(mapping, perceived)
     with _naming_options_of("map", "mapping") as named:
-        plan = plan_run(source, mapping, lambda line: notify(named(line)))
+        plan = plan_run(source, mapping, lambda line: notify(named(line)), images=True)
     truth, truths = read_cells(plan, config)
     frames = prepare_training_frames(plan, truth, saved, config.map_truth.anchor, notify)
     train, validation = _split(frames, config.data.validation_share, plan.sequence.name)
@@ -401,7 +405,7 @@ def prepare_training_frames(
     hidden = [index for index in range(len(plan.labeller.classes)) if index not in truth.rasters]
     network = Segmenter(first) if hidden and anchor > 0 else None
     kept = []
-    for prepared in prepare_frames(plan.sequence, plan.front_end, needs="image"):
+    for prepared in plan.prepare():
         if prepared.frame is None or prepared.rectified is None:
             notify(f"skipped: {prepared.fault}")
             continue

@@ -18,7 +18,7 @@ from jaxmap.geometry.bounds import map_bytes, view_boxes
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.attributes import MapAttributes
-from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, prepare_frames, run_sequence
+from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, run_sequence
 from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import MovingBlock, TileStore
 from jaxmap.planning.ground import map_layers
@@ -26,12 +26,23 @@ from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lin
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.checking import finding_line, findings_tree
 from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
+from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import RunLog
-from jaxmap.runs.mapping_plan import Notify, Plan
+from jaxmap.runs.mapping_plan import Plan
+from jaxmap.runs.run_frames import write_frame_table
 from jaxmap.types import VoxelMap
 
+_PICTURES_AT_ONCE = 4
+"""Frames that wait for their pictures to be written; each holds some 10 MB."""
 FEW_MATCHED = 0.01
 """Where fewer pixels of a frame have a depth in range, it is not the bounds that leave a map empty."""
+
+Watch = Callable[[FusedFrame, VoxelMap], None]
+"""Looks at the map after each frame; the next frame takes the map's memory."""
+
+
+def unwatched(fused: FusedFrame, voxel_map: VoxelMap) -> None:
+    """Looks at nothing."""
 
 
 def run_plan(
@@ -42,6 +53,7 @@ def run_plan(
     checkpoint_every_s: float,
     notify: Notify,
     on_frame: Callable[[FusedFrame], None] = lambda fused: None,
+    watch: Watch = unwatched,
     profile: bool = False,
     report: bool = True,
 ) -> dict[str, Any]:
@@ -57,6 +69,7 @@ def run_plan(
         checkpoint_every_s: how often the map is saved on the way.
         notify: takes lines for the user.
         on_frame: called after each frame.
+        watch: looks at the map after each frame (`viewing.live_view`).
         profile: record a trace of some steps into the folder, and report where their time went.
         report: write the page of the run.
 
@@ -74,19 +87,14 @@ def run_plan(
         notify(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
     step_profile, program = StepProfile(folder.profile if profile else None), None
     saved_s = resumed_s = time.perf_counter()
-    frames = prepare_frames(
-        plan.sequence,
-        plan.front_end,
-        plan.label_folder,
-        needs=plan.labeller.needs,
-        pose_errors=plan.pose_errors,
-        first=log.next_index,
-    )
+    if plan.keeper is not None:
+        plan.keeper.begin(folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
+    frames = plan.prepare(log.next_index, keep_in=folder.observations)
     run = run_sequence(
         plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form, cover=memory.cover
     )
-    key_frames: list[tuple[PreparedFrame, int]] = []
+    pictures = _Pictures(plan, folder)
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
@@ -95,27 +103,27 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
-            if fused.info is not None and fused.prepared.index in plan.key_frames:
-                # Pictures wait for the next save; noted before the frame counts, so that an interrupt loses none.
-                key_frames.append((fused.prepared, int(voxel_map.frames_fused) - 1))
+            pictures.note(fused, voxel_map)
             log.add(fused, _disparity_scores(plan, fused))
+            resumed_s += pictures.write_many()
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
+            watch(fused, voxel_map)
             if time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
-                _save(plan, folder, log, memory, voxel_map, key_frames)
+                _save(plan, log, memory, voxel_map, pictures)
                 saved_s = resumed_s = time.perf_counter()
     except KeyboardInterrupt:
         # Only where map and log speak of the same frames: the interrupt may come between the two.
         if not voxel_map.log_odds.is_deleted() and int(voxel_map.frames_fused) == log.fused > 0:
-            _save(plan, folder, log, memory, voxel_map, key_frames)
+            _save(plan, log, memory, voxel_map, pictures)
             notify(f"interrupted and saved after {log.next_index} frames; --resume goes on there")
         raise
     finally:
         step_profile.close()
     log.total_s += time.perf_counter() - resumed_s
-    _write_key_frames(plan, folder, key_frames)
+    pictures.write()
     if not log.fused:
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
@@ -185,16 +193,9 @@ class _TiledMap:
         return open_map(self.path)
 
 
-def _save(
-    plan: Plan,
-    folder: RunFolder,
-    log: RunLog,
-    memory: _WholeMap | _TiledMap,
-    voxel_map: VoxelMap,
-    key_frames: list[tuple[PreparedFrame, int]],
-) -> None:
+def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: _Pictures) -> None:
     """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
-    _write_key_frames(plan, folder, key_frames)
+    pictures.write()
     memory.save(voxel_map, _attributes(plan, log, voxel_map))
 
 
@@ -252,12 +253,15 @@ def _write_outputs(
     plan: Plan, folder: RunFolder, log: RunLog, reader: MapReader, details: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes all that a run leaves beside its map, and returns its metrics, the details among them."""
-    skipped = {frame["frame"] for frame in log.skipped}
+    skipped = {frame["frame"]: frame["reason"] for frame in log.skipped}
+    if plan.keeper is not None:
+        plan.keeper.finish(folder.observations, skipped)
     fused_frames = np.array([frame.name not in skipped for frame in plan.sequence.frames])
     timestamps_s = np.array([frame.timestamp_s for frame in plan.sequence.frames])
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
+    write_frame_table(folder.frames, plan.sequence.frames, skipped)
     write_exports(folder, reader)
     metrics = _metrics(plan, log, reader) | count_missed(plan.rule, reader, plan.members) | details
     write_json(folder.metrics, metrics)
@@ -317,15 +321,37 @@ def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
     )
 
 
-def _write_key_frames(plan: Plan, folder: RunFolder, key_frames: list[tuple[PreparedFrame, int]]) -> None:
-    """Writes pictures of frames, with the labels that the step gave each as the so manieth, and empties the list."""
-    for prepared, number in key_frames:
-        assert prepared.frame is not None and prepared.rectified is not None
-        labels = None
-        if plan.labeller.classes:
-            labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
-        write_key_frame(folder, prepared.index, prepared.rectified, labels, plan.labeller.classes)
-    key_frames.clear()
+class _Pictures:
+    """Key frames that wait for their pictures to be written."""
+
+    def __init__(self, plan: Plan, folder: RunFolder) -> None:
+        self.plan, self.folder = plan, folder
+        self.waiting: list[tuple[PreparedFrame, int]] = []
+
+    def note(self, fused: FusedFrame, voxel_map: VoxelMap) -> None:
+        """Keeps a key frame; to be called before the frame counts, so that an interrupt loses none."""
+        if fused.info is not None and fused.prepared.index in self.plan.key_frames:
+            self.waiting.append((fused.prepared, int(voxel_map.frames_fused) - 1))
+
+    def write_many(self) -> float:
+        """Writes pictures where many wait, and returns how long that took, in seconds."""
+        if len(self.waiting) < _PICTURES_AT_ONCE:
+            return 0.0
+        started_s = time.perf_counter()
+        self.write()
+        return time.perf_counter() - started_s
+
+    def write(self) -> None:
+        """Writes all, with the labels that the step gave each frame as the so manieth."""
+        plan = self.plan
+        for prepared, number in self.waiting:
+            assert prepared.frame is not None and prepared.rectified is not None
+            labels = None
+            if plan.labeller.classes:
+                labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
+            large = plan.key_frames[prepared.index]
+            write_key_frame(self.folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
+        self.waiting.clear()
 
 
 def _metrics(plan: Plan, log: RunLog, reader: MapReader) -> dict[str, Any]:
@@ -357,13 +383,14 @@ def _metrics(plan: Plan, log: RunLog, reader: MapReader) -> dict[str, Any]:
         | {
             "width_px": camera.width_px,
             "height_px": camera.height_px,
-            "rectified_here": plan.front_end.rectifier is not None,
+            "rectified_here": plan.front_end.rectified_here,
             **({} if (turn := plan.front_end.alignment_rad) is None else {"alignment_rad": turn.round(8).tolist()}),
             # Poses of the rectified camera, relative to the site origin.
             "key_frames": {
                 f"{index:06d}": (sequence.T_world_camera[index] @ plan.front_end.T_raw_rectified).round(6).tolist()
-                for index in sorted(plan.key_frames)
+                for index in plan.key_frames
             },
+            "T_raw_rectified": plan.front_end.T_raw_rectified.round(9).tolist(),
         },
         "grid": {
             "shape": list(grid.shape),

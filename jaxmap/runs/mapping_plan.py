@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,39 +12,25 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from jaxmap.checks.check import open_front_end
-from jaxmap.checks.finding import Finding
-from jaxmap.datasets import StereoSequence, open_sequence
+from jaxmap.datasets import StereoSequence
 from jaxmap.datasets.base import OnFrame
-from jaxmap.datasets.label_files import LabelFolder, open_label_folder
-from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.ensemble.draws import draw_ensemble
-from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.errors import UsageError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, site_lattice, usable_depth
 from jaxmap.geometry.grid import window_shape
 from jaxmap.geometry.options import GridOptions, Triple
-from jaxmap.host.files import bundled, real_path
-from jaxmap.labellers.base import Labeller, make_no_labeller
-from jaxmap.labellers.deeplab import make_deeplab_labeller
-from jaxmap.labellers.files import make_files_labeller
-from jaxmap.labellers.plane import make_plane_labeller
-from jaxmap.labellers.relief import combine_with_relief, make_relief_labeller
-from jaxmap.labels import ROVER_CLASSES
-from jaxmap.mapping.sequence import frame_form
+from jaxmap.mapping.observations import Observations
+from jaxmap.mapping.sequence import PreparedFrame, frame_form, observed_frames, prepare_frames
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.mapping.tiles import block_shape, whole_tiles
-from jaxmap.models.checkpoint import SavedModel, load_network
-from jaxmap.models.tensor_files import shortened
-from jaxmap.runs.checking import warn_of_faults
-from jaxmap.runs.config import MapConfig, config_tree
+from jaxmap.runs.config import MapConfig, PerceiveConfig
+from jaxmap.runs.labelling import Notify, as_usage_error
+from jaxmap.runs.perceiving import Keeper, make_keeper
+from jaxmap.runs.perception import Perception, plan_perception, saw_relief
 from jaxmap.stereo.front_end import StereoFrontEnd
-from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import MAX_TENSOR_ELEMENTS, Frame, GridSpec, StereoCamera, make_grid
-
-BUNDLED_WIDTH_PX = 512
-"""Width that the bundled network runs at: at twice that it takes four times as long for a hundredth of IoU."""
 
 DEFAULT_VOXEL_M: Triple = (0.05, 0.05, 0.2)
 """The voxels of a map whose settings name none."""
@@ -116,135 +101,15 @@ def describe_grid(
     )
 
 
-@dataclass(frozen=True)
-class ModelFile:
-    """The file of the network that labels, and the SHA-256 of its content."""
+@dataclass(frozen=True, kw_only=True)
+class Plan(Perception):
+    """A run, decided in full before the first frame is fused.
 
-    path: Path
-    sha256: str
-
-
-def choose_label_folder(config: MapConfig, sequence: StereoSequence) -> LabelFolder | None:
-    """The folder of labels that the settings name, where labels come from files.
-
-    Raises:
-        JaxmapError: it cannot be read.
-        UsageError: it is missing, or means nothing to the labeller.
+    Attributes:
+        keeper: keeps what is perceived on the way, where that was asked for.
+        pose_errors: of the members of an ensemble, for each frame.
     """
-    if config.labeller != "files":
-        if config.labels is not None:
-            raise UsageError(
-                f"--labels is given, but the labeller is {config.labeller}", fix="add --labeller files, or leave it out"
-            )
-        return None
-    if config.labels is None:
-        raise UsageError("the files labeller needs a folder of labels", fix="give --labels DIR")
-    labels_are = config.labels_are
-    if labels_are == "auto":
-        if isinstance(sequence.camera, StereoRig) or sequence.rectify_labels is not None:
-            raise UsageError(
-                "the images are raw, and labels may lie on raw or on rectified pixels",
-                fix="say which: --labels-are raw (your network saw the camera's images) or rectified",
-            )
-        labels_are = "rectified"
-    folder = open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
-    return replace(folder, rectify=sequence.rectify_labels)
 
-
-def choose_model(config: MapConfig) -> tuple[ModelFile | None, SavedModel | None]:
-    """The network that labels, where the labeller is one.
-
-    Raises:
-        JaxmapError: the file cannot be read, or holds no whole network.
-        UsageError: it is not the one that the settings name.
-    """
-    if config.labeller != "deeplab":
-        if config.model is not None:
-            raise UsageError(
-                f"--model is given, but the labeller is {config.labeller}",
-                fix="take --labeller deeplab, or leave it out",
-            )
-        return None, None
-    path = config.model or bundled("rover.safetensors")
-    saved = load_network(path)
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    if config.model_sha256 is not None and config.model_sha256.lower() != sha256:
-        raise UsageError(
-            f"the model's SHA-256 does not start with {config.model_sha256[:16]}",
-            where=path,
-            fix="give the model of that run, or leave out model_sha256",
-        )
-    return ModelFile(path, sha256), saved
-
-
-def describe_network(model: ModelFile, network: SavedModel, classes: Sequence[str]) -> str:
-    """One line on the network and its classes."""
-    count = len(network.architecture.classes)
-    return (
-        f"labels by {model.path.name} ({network.architecture.backbone}, {count} classes), "
-        f"mapped as {shortened(classes)}; the settings classes and deeplab.class_map choose"
-    )
-
-
-def choose_labeller(
-    config: MapConfig, label_folder: LabelFolder | None, network: SavedModel | None, camera: StereoCamera
-) -> Labeller:
-    """What labels the points.
-
-    Args:
-        config: the settings.
-        label_folder: of the files labeller.
-        network: of the deeplab labeller.
-        camera: whose images it labels.
-
-    Raises:
-        JaxmapError: classes or numbers that do not serve.
-    """
-    classes = config.classes
-    if classes is not None and len(set(classes)) < len(classes):
-        raise UsageError(f"a class is named twice: {' '.join(classes)}", fix="give each class once")
-    if config.relief.combine and config.labeller not in ("deeplab", "files"):
-        raise UsageError(
-            f"--relief is given, but the labeller is {config.labeller}",
-            fix="take --labeller deeplab or files, or leave --relief out",
-        )
-    if network is not None:
-        deeplab, shrink = config.deeplab, BUNDLED_WIDTH_PX / camera.width_px
-        if config.model is None and deeplab.size_px is None and shrink < 1:
-            deeplab = replace(deeplab, size_px=(round(shrink * camera.height_px), BUNDLED_WIDTH_PX))
-        labeller = make_deeplab_labeller(network, classes, deeplab)
-        known = {config.relief.ground, config.relief.rock} <= set(labeller.classes)
-        return _with_relief(labeller, config, by_default=known)
-    classes = ROVER_CLASSES if classes is None else classes
-    if label_folder is not None:
-        return _with_relief(make_files_labeller(classes, soft=label_folder.soft), config, by_default=False)
-    if config.labeller == "relief":
-        return make_relief_labeller(classes, config.relief)
-    if config.labeller == "plane":
-        return make_plane_labeller(classes, config.plane)
-    return make_no_labeller()
-
-
-def _with_relief(labeller: Labeller, config: MapConfig, *, by_default: bool) -> Labeller:
-    combine = by_default if config.relief.combine is None else config.relief.combine
-    return combine_with_relief(labeller, config.relief) if combine else labeller
-
-
-Notify = Callable[[str], None]
-
-_KEY_FRAMES = 4
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A run, decided in full before the first frame is fused."""
-
-    source: str
-    sequence: StereoSequence
-    front_end: StereoFrontEnd
-    labeller: Labeller
-    label_folder: LabelFolder | None
-    model: ModelFile | None
     grid: GridSpec
     depth_range_m: tuple[float, float]
     rule: FusionRule
@@ -252,12 +117,11 @@ class Plan:
     fusion: dict[str, Any]
     mapper: Mapper
     key: PRNGKeyArray
+    keeper: Keeper | None = None
     pose_errors: Float[np.ndarray, "N M 6"] | None = None
     """Of the members of an ensemble, for each frame."""
     block_shape: tuple[int, int, int] | None = None
     """Of a map that is larger than the memory it may take: voxels along each axis of the part that is in memory."""
-    findings: tuple[Finding, ...] = ()
-    """What the quick check of the sequence has found."""
 
     @property
     def members(self) -> int:
@@ -267,23 +131,34 @@ class Plan:
     @property
     def frame_form(self) -> Frame:
         """The form of the frames that the step takes."""
-        return frame_form(self.front_end.camera, self.labeller, self.members)
+        kept = self.observations or self.keeper
+        shape = () if kept is None else kept.attributes.kept_shape
+        return frame_form(self.front_end.camera, self.labeller, self.members, shape)
 
-    @property
-    def key_frames(self) -> set[int]:
-        """Indices of the frames whose pictures are kept."""
-        return {int(index) for index in np.linspace(0, len(self.sequence.frames) - 1, _KEY_FRAMES)}
+    def prepare(self, first: int = 0, keep_in: Path | None = None) -> Iterator[PreparedFrame]:
+        """The frames from one on, made ready ahead of their use.
 
-    @property
-    def images(self) -> Iterator[Path]:
-        """The files of all images."""
-        return (image for frame in self.sequence.frames for image in (frame.left, frame.right))
+        Args:
+            first: index of the first.
+            keep_in: the observations to be written on the way, with a keeper.
+        """
+        if self.observations is not None:
+            more: Any = {"left_image": self.left_image, "pose_errors": self.pose_errors}
+            return observed_frames(self.observations, first=first, **more)
+        if self.keeper is not None and keep_in is not None:
+            return self.keeper.frames(keep_in, range(first, len(self.sequence.frames)), self.pose_errors)
+        return prepare_frames(
+            self.sequence,
+            self.front_end,
+            self.label_folder,
+            needs=self.labeller.needs,
+            pose_errors=self.pose_errors,
+            indices=range(first, len(self.sequence.frames)),
+        )
 
-    def settings(self, config: MapConfig) -> dict[str, Any]:
+    def settings(self, config: PerceiveConfig) -> dict[str, Any]:
         """The settings as plain values, with the sequence and what was left to the data resolved."""
-        classes = {"classes": list(self.labeller.classes)} if self.labeller.classes else {}
-        model = {"model_sha256": self.model.sha256} if self.model is not None else {}
-        return {"sequence": self.source, **config_tree(config), **classes, **model}
+        return super().settings(config) | ({} if self.keeper is None else {"keep_observations": True})
 
     def digest(self, count: int) -> str:
         """A fingerprint of the first frames, their poses and the camera: what a resumed run must share."""
@@ -302,52 +177,43 @@ def plan_run(
     notify: Notify,
     on_frame: OnFrame = lambda done, total: None,
     *,
+    keep: bool = False,
+    images: bool = False,
     in_tiles: bool = False,
 ) -> Plan:
-    """Opens the sequence and decides range, bounds, labeller and step.
+    """Opens the sequence or its observations, and decides range, bounds, labeller and step.
 
     Args:
-        source: the folder of one sequence, or `sample:NAME`.
+        source: the folder of one sequence or of observations, or `sample:NAME`.
         config: the settings.
         notify: takes lines for the user.
         on_frame: is told of the progress of odometry, where it gives the poses.
+        keep: keep what is perceived, as observations.
+        images: of observations, too, let the labeller see the images (`plan_perception`).
         in_tiles: a map that takes more memory than it may is kept in tiles, not refused.
 
     Raises:
         JaxmapError: the data or the settings do not serve.
     """
-    sequence = open_sequence(source, config, on_frame)
-    if config.strict and sequence.pose_faults:
-        raise JaxmapError(sequence.pose_faults[0], fix="mend the poses, or map without --strict")
-    front_end = open_front_end(sequence, config.stereo, notify)
-    camera = front_end.camera
-    _describe_sequence(sequence, camera, notify)
-    findings: tuple[Finding, ...] = ()
-    # The bundled samples are as they should be, unless other poses or another camera are put to them.
-    if not source.startswith(SAMPLE_PREFIX) or config.poses or config.calibration:
-        findings = warn_of_faults(sequence, front_end, strict=config.strict, notify=notify)
+    seen = plan_perception(source, config, notify, on_frame, images=images)
+    keeper = None
+    if keep:
+        keeper = make_keeper(seen, config, config.fusion.disparity_sigma_px)
+        seen = replace(seen, labeller=keeper.labeller)
+    elif seen.observations is not None:
+        _note_other_noise(seen.observations, config, notify)
+    sequence, front_end, labeller, camera = seen.sequence, seen.front_end, seen.labeller, seen.front_end.camera
     depth_range_m = _depth_range(config, camera)
-    label_folder = choose_label_folder(config, sequence)
-    model, network = choose_model(config)
-    with _as_usage_error():
-        labeller = choose_labeller(config, label_folder, network, front_end.camera)
-        if model is not None and network is not None:
-            notify(describe_network(model, network, labeller.classes))
+    with as_usage_error():
         grid = choose_grid(config.grid, sequence, front_end, depth_range_m[1])
         rule = config.fusion.rule(labeller.classes)
         fusion_params = make_fusion_params(labeller.classes, config.fusion)
         members = _members(config, rule, labeller.classes)
     # The members of an ensemble stand elsewhere.
     T_known = None if members else sequence.T_world_camera @ front_end.T_raw_rectified
-    block = None
-    limit_bytes = min(config.grid.max_memory_gib * 2**30, 4 * MAX_TENSOR_ELEMENTS)
-    if in_tiles and not members and map_bytes(grid, len(labeller.classes)) > limit_bytes:
-        shape = window_shape(grid, camera, depth_range_m[1], T_known)
-        block = block_shape(whole_tiles(grid), shape, 1 + len(labeller.classes), limit_bytes)
-    if block is None:
-        check_memory(grid, len(labeller.classes), config.grid.max_memory_gib, members)
-    else:
-        grid = whole_tiles(grid)
+    window = window_shape(grid, camera, depth_range_m[1], T_known)
+    tiled = in_tiles and not members
+    grid, block = _fit_memory(grid, window, len(labeller.classes), members, config.grid.max_memory_gib, tiled=tiled)
     notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block))
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
@@ -356,12 +222,8 @@ def plan_run(
         ensemble, pose_errors = draw_ensemble(key, fusion_params, timestamps_s, config.ensemble)
 
     return Plan(
-        source=source if source.startswith(SAMPLE_PREFIX) else str(real_path(source)),
-        sequence=sequence,
-        front_end=front_end,
-        labeller=labeller,
-        label_folder=label_folder,
-        model=model,
+        **{one.name: getattr(seen, one.name) for one in fields(seen)},
+        keeper=keeper,
         grid=grid,
         depth_range_m=depth_range_m,
         rule=rule,
@@ -379,22 +241,31 @@ def plan_run(
         key=key,
         pose_errors=pose_errors,
         block_shape=block,
-        findings=findings,
     )
 
 
-def _describe_sequence(sequence: StereoSequence, camera: StereoCamera, notify: Notify) -> None:
-    """What was opened, what its reader noted, and where its world begins."""
-    notify(
-        f"{sequence.name} ({sequence.dataset}): {len(sequence.frames)} frames "
-        f"of {camera.width_px} x {camera.height_px} px, f {float(camera.fx_px):.2f} px, "
-        f"baseline {float(camera.baseline_m):.5f} m"
-    )
-    for note in sequence.notes:
-        notify(f"note: {note}")
-    if sequence.site_origin.any():
-        origin = " ".join(f"{number:.0f}" for number in sequence.site_origin)
-        notify(f"site origin {origin} ({sequence.crs or 'no CRS given: --crs'}); bounds are relative to it")
+def _fit_memory(
+    grid: GridSpec, window: tuple[int, int, int], class_count: int, members: int, limit_gib: float, *, tiled: bool
+) -> tuple[GridSpec, tuple[int, int, int] | None]:
+    """The grid and, where it is kept in tiles, voxels along each axis of the block that is in memory.
+
+    Raises:
+        JaxmapError: it takes more memory than it may, or would even in tiles.
+    """
+    limit_bytes = min(limit_gib * 2**30, 4 * MAX_TENSOR_ELEMENTS)
+    if tiled and map_bytes(grid, class_count) > limit_bytes:
+        block = block_shape(whole_tiles(grid), window, 1 + class_count, limit_bytes)
+        if block is not None:
+            return whole_tiles(grid), block
+    check_memory(grid, class_count, limit_gib, members)
+    return grid, None
+
+
+def _note_other_noise(observations: Observations, config: MapConfig, notify: Notify) -> None:
+    """Says where the network was shown relief under another noise of the disparity than the map's."""
+    then_px, now_px = observations.attributes.disparity_sigma_px, config.fusion.disparity_sigma_px
+    if config.labeller == "deeplab" and saw_relief(observations.attributes) and then_px != now_px:
+        notify(f"note: the network saw relief under fusion.disparity_sigma_px {then_px:g}, and is not asked again")
 
 
 def _depth_range(config: MapConfig, camera: StereoCamera) -> tuple[float, float]:
@@ -427,14 +298,3 @@ def _members(config: MapConfig, rule: FusionRule, classes: Sequence[str]) -> int
             fix="name a class with --fusion.priority-classes, or leave the ensemble out",
         )
     return members
-
-
-@contextmanager
-def _as_usage_error() -> Iterator[None]:
-    """What is refused while settings are taken up is the fault of the settings."""
-    try:
-        yield
-    except UsageError:
-        raise
-    except JaxmapError as error:
-        raise UsageError(error.what, where=error.where, fix=error.fix or "see jaxmap map --help") from error

@@ -16,12 +16,12 @@ from jaxmap.errors import UsageError
 from jaxmap.fusion.params import fusion_numbers
 from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import write_json, write_yaml
-from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.report.tuning_page import tuning_page
 from jaxmap.runs.checking import finding_line
 from jaxmap.runs.config import MapConfig, config_tree
 from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
-from jaxmap.runs.mapping_plan import Notify, Plan, plan_run
+from jaxmap.runs.labelling import Notify
+from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
 from jaxmap.tuning.descent import Step, descend
 from jaxmap.tuning.evidence_cache import CacheRecipe, build_cache, tunable_numbers
@@ -223,8 +223,7 @@ class TuningRun:
 
             def frames(plan: Plan = plan) -> Any:
                 nonlocal done
-                needs = plan.labeller.needs
-                for prepared in prepare_frames(plan.sequence, plan.front_end, plan.label_folder, needs=needs):
+                for prepared in plan.prepare():
                     if prepared.frame is not None:
                         yield prepared.frame
                     elif prepared.fault is not None and self._config.strict:

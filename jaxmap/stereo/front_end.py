@@ -25,8 +25,9 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    `too_near` is the share of pixels that were left out because they are nearer than the searched disparities reach,
-    and `nearest_px` the disparity of the nearest of them.
+    The images are empty where observations, which hold none, are read again. `too_near` is the share of pixels that
+    were left out because they are nearer than the searched disparities reach, and `nearest_px` the disparity of the
+    nearest of them.
     """
 
     left: np.ndarray
@@ -43,6 +44,7 @@ class StereoFrontEnd:
 
     Attributes:
         camera: the rectified camera.
+        rectified_here: whether the images are raw, and rectified by it.
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
         alignment_rad: rotation vector by which the rectified right camera is corrected, or None.
     """
@@ -70,6 +72,7 @@ class StereoFrontEnd:
             camera = self.rectifier.camera
         elif alignment_rad is not None:
             self._right_homography = alignment_homography(camera, alignment_rad)
+        self.rectified_here = self.rectifier is not None
         self.camera: StereoCamera = camera
         self.matcher = Matcher(options, camera.width_px)
         self._near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None

@@ -26,7 +26,7 @@ from jaxmap.fusion.options import FusionOptions
 from jaxmap.geometry.options import DepthOptions, GridOptions
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.files import bundled
-from jaxmap.mapping.sequence import PreparedFrame, prepare_frames, run_sequence
+from jaxmap.mapping.sequence import PreparedFrame, run_sequence
 from jaxmap.runs.config import MapConfig, load_config
 from jaxmap.runs.evaluation import TruthOptions, class_layer_of, read_truth
 from jaxmap.runs.mapping_plan import Plan, plan_run
@@ -96,8 +96,7 @@ class Frames:
         """The run of these settings; the first one prepares the frames."""
         plan = plan_run(self.sequence, config, lambda line: None)
         if not self.prepared:
-            needs = plan.labeller.needs
-            self.prepared = list(prepare_frames(plan.sequence, plan.front_end, plan.label_folder, needs=needs))
+            self.prepared = list(plan.prepare())
         return plan
 
     def scored(self, config: MapConfig, chosen: Sequence[PreparedFrame] | None = None) -> Scored:

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets import ReadOptions, StereoSequence, open_sequence
 from jaxmap.datasets.poses import poses_at, read_poses, write_tum
+from jaxmap.evaluation.pose_errors import relative_errors
 
 STRETCHES = 5
 KITTI, KITTI_FROM = SHARED / "realdata" / "kitti_odometry", 12
@@ -47,20 +48,19 @@ def drift(T_world_camera: np.ndarray, T_true: np.ndarray) -> Drift:
     steps_m = np.linalg.norm(np.diff(T_true[:, :3, 3], axis=0), axis=1)
     way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
 
-    def error(first: int, last: int) -> tuple[float, float]:
-        moved, truly = (np.linalg.inv(T[first]) @ T[last] for T in (T_world_camera, T_true))
-        off, length_m = np.linalg.inv(truly) @ moved, way_m[last] - way_m[first]
-        turned = np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude())
-        return float(np.linalg.norm(off[:3, 3]) / length_m), float(turned / length_m)
+    def errors_between(pairs: list[tuple[int, int]]) -> np.ndarray:
+        ends = np.array(pairs, int).reshape(-1, 2)
+        lengths_m = way_m[ends[:, 1]] - way_m[ends[:, 0]]
+        return np.stack(relative_errors(T_world_camera, T_true, ends)) / lengths_m
 
-    errors = []
+    pairs = []
     for stretch in range(1, STRETCHES + 1):
         length_m = way_m[-1] * stretch / STRETCHES
         lasts = np.searchsorted(way_m, way_m + length_m - 1e-6)
-        errors += [error(first, last) for first, last in enumerate(lasts.tolist()) if last < len(way_m)]
+        pairs += [(first, last) for first, last in enumerate(lasts.tolist()) if last < len(way_m)]
     tilt = np.arccos(np.clip(T_world_camera[0, 2, :3] @ T_true[0, 2, :3], -1, 1))
-    end, end_turned = error(0, len(way_m) - 1)
-    translation, rotation = np.mean(errors, axis=0).tolist()
+    end, end_turned = errors_between([(0, len(way_m) - 1)])[:, 0].tolist()
+    translation, rotation = errors_between(pairs).mean(axis=1).tolist()
     return Drift(float(way_m[-1]), end, end_turned, translation, rotation, float(np.degrees(tilt)))
 
 

@@ -76,7 +76,7 @@ def settings_of(cli, monkeypatch, tmp_path):
     def settings(*words: object) -> MapConfig:
         planned = []
 
-        def plan_run(_: str, config: MapConfig, *more: object) -> None:
+        def plan_run(_: str, config: MapConfig, *more: object, **options: object) -> None:
             planned.append(config)
             raise JaxmapError("far enough")
 

@@ -97,6 +97,7 @@ FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "map: out lies in a file": (1, lambda given: ["map", given.scene, "--out", below_a_file(given)]),
     "map: unknown key": (2, lambda given: mapped(given, "--config", config_of(given, "labeler: plane\n"))),
     "map: out of range": (2, lambda given: mapped(given, "--plane.threshold-m", "-1")),
+    "view: no run": (1, lambda given: ["view", given.folder / "nowhere", "--save", given.folder / "f.rrd"]),
     "evaluate: no run": (1, lambda given: ["evaluate", given.folder / "nowhere", given.folder / "truth.tif"]),
     "plan: no run": (1, lambda given: ["plan", given.folder / "nowhere", *ENDS]),
     "plan: unknown rover": (2, lambda given: ["plan", given.run, *ENDS, "--rover", "sparrow"]),

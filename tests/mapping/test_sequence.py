@@ -234,7 +234,7 @@ def test_the_same_key_gives_the_same_map_however_many_threads_read(scene_folder)
 
 def test_frames_carry_their_truth_times_and_index(scene_folder):
     plan = planned(scene_folder)
-    prepared = list(prepare_frames(plan.sequence, plan.front_end, first=2))
+    prepared = list(prepare_frames(plan.sequence, plan.front_end, indices=range(2, FRAMES)))
     assert [frame.index for frame in prepared] == [2, 3, 4, 5]
     for frame in prepared:
         np.testing.assert_array_equal(frame.rectified.left, scene_frame(frame.index).left)

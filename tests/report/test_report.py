@@ -3,82 +3,36 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from html_tables import tables_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from made_runs import NASTY, SITE, add_cameras, make_run
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.mapping.store import MapAttributes, save_map
 from jaxmap.report import voxel_view as voxel_view_module
+from jaxmap.report.drive_view import MAX_KEY_FRAMES, ground_outline
+from jaxmap.report.image_colours import SeenFrame
 from jaxmap.report.page import ACCENT, svg_of
-from jaxmap.report.run_page import MAX_KEY_FRAMES, write_report
+from jaxmap.report.run_page import write_report
 from jaxmap.report.tuning_page import tuning_page
 from jaxmap.report.voxel_view import exposed_faces, merge_voxels, voxel_view
 from jaxmap.report.wording import name_and_unit, number_text, value_text
-from jaxmap.types import VoxelMap, make_grid, make_voxel_map
-
-SITE = np.array([588123.4, 5790321.6, 3.25])
-NASTY = '<script>alert("x")</script> & co'
-
-
-def make_run(run: Path, *, classes: tuple[str, ...] = ROVER_CLASSES, name: str = "beach, part 1") -> Path:
-    """A run folder with a bumpy ground, a few rocks and two key frames."""
-    (run / "pictures").mkdir(parents=True)
-    grid = make_grid([-4, -3, -1], [8, 5, 1.4], 0.2)
-    x, y = np.meshgrid(np.arange(grid.shape[0]), np.arange(grid.shape[1]), indexing="ij")
-    rock = np.hypot(x % 20 - 10, y % 15 - 7) < 3
-    z = np.round(3 + 1.5 * np.sin(x / 7) + np.cos(y / 5) + 3 * rock).astype(int).clip(0, grid.shape[2] - 1)
-    log_odds = np.zeros((1 + len(classes), *grid.shape), np.float32)
-    log_odds[0, x, y, z] = 2.0
-    for index, label in enumerate(classes):
-        log_odds[1 + index, x, y, z] = np.where(rock == (label == "rock"), 1.5 if label != "background" else -2.0, -1.5)
-    voxel_map = make_voxel_map(grid, classes)
-    voxel_map = VoxelMap(jnp.asarray(log_odds), jnp.asarray(40), grid, tuple(classes))
-    fusion = {"params": {"occupancy_threshold": 0.6, "class_prior": 0.4}, "rule": {"priority_classes": ["rock"]}}
-    save_map(run / "map.zarr", voxel_map, MapAttributes(crs="EPSG:32631", site_origin=SITE, fusion=fusion))
-    positions = np.stack([np.linspace(-3, 6, 20), np.linspace(0, 2, 20), np.full(20, 1.2)], axis=-1) + SITE
-    lines = [f"{i} {px:.6f} {py:.6f} {pz:.6f} 0 0 0 1" for i, (px, py, pz) in enumerate(positions)]
-    (run / "poses.tum").write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]))
-    (run / "config.yaml").write_text(f"name: {NASTY}\n")
-    for frame in ("000000", "000020"):
-        for kind, colour in (("left", 120), ("disparity", 60), ("labels", 200)):
-            Image.new("RGB", (800, 600), (colour, colour, 90)).save(run / "pictures" / f"{frame}_{kind}.png")
-    Image.new("RGB", (300, 200), (240, 240, 240)).save(run / "bev.png")
-    (run / "map.ply").write_bytes(b"ply")
-    metrics = {
-        "jaxmap_version": "0.1.0",
-        "sequence": {
-            "name": name,
-            "dataset": "folder",
-            "frames": 42,
-            "fused": 40,
-            "skipped": [{"frame": "left_7", "reason": "no pose within 0.2 s"}],
-            "path_length_m": 9.2,
-            "notes": ["heading from motion"],
-        },
-        "grid": {"shape": [60, 40, 12], "voxel_size_m": [0.2, 0.2, 0.2], "depth_range_m": [1.0, 8.5]},
-        "labeller": "deeplab",
-        "times": {"frames_per_s": 4.8, "stages": {"match": {"median_ms": 61.5, "p95_ms": 70.0, "total_s": 2.5}}},
-        "points": {"valid_fraction": 0.812},
-        "voxels": {"by_class": {"sand": 1800, "rock": 600}},
-        "memory": {"peak_resident_mib": 1434.0},
-        "unheard_of": {"new_number_m": 1.25},
-    }
-    (run / "metrics.json").write_text(json.dumps(metrics))
-    return run
+from jaxmap.types import make_grid, make_voxel_map
 
 
 def voxels_of(index: np.ndarray, label: np.ndarray | None = None, size_m=(0.2, 0.3, 0.1)) -> OccupiedVoxels:
@@ -236,11 +190,16 @@ def page_of(run: Path) -> Page:
     return Page((run / "report.html").read_text(encoding="utf-8"))
 
 
+def figure_of(page: Page) -> dict:
+    """The 3D view, unpacked."""
+    return json.loads(gzip.decompress(base64.b64decode(page.scripts[0])))
+
+
 def test_page_shows_the_run(made_run) -> None:
     page = page_of(made_run)
     text = page.text.replace("\N{NO-BREAK SPACE}", " ").replace("\N{NARROW NO-BREAK SPACE}", " ")
     for expected in (
-        *("Top-down map", "In 3D", "Key frames", "Frame 000020", "Metrics", "Skipped frames", "Notes", "Configuration"),
+        *("Top-down map", "The drive", "Frame 000020", "Metrics", "Skipped frames", "Notes", "Configuration"),
         *("folder · labels: deeplab · EPSG:32631", "40", "9.2 m", "4.8", "1.4 GiB", "96 m²", "2 400"),
         *("left_7", "no pose within 0.2 s", "heading from motion", "61.5", "81.2 %", "New number", "1.25 m"),
         *("60 × 40 × 12", "1, 8.5 m", "Made by jaxmap 0.1.0."),
@@ -282,16 +241,53 @@ def test_class_names_cannot_leave_the_script(tmp_path) -> None:
     run = make_run(tmp_path / "run", classes=("sand</script><b>", "rock"))
     write_report(run)
     page = page_of(run)
-    figure = json.loads(page.scripts[0])
+    figure = figure_of(page)
     assert "sand</script><b>" in figure["data"][0]["colorbar"]["ticktext"]
     assert not page.all("b")
 
 
 def test_path_is_drawn_in_the_maps_world(made_run) -> None:
-    figure = json.loads(page_of(made_run).scripts[0])
+    figure = figure_of(page_of(made_run))
     line = next(trace for trace in figure["data"] if trace.get("mode") == "lines")
     x = np.frombuffer(base64.b64decode(line["x"]["bdata"]), np.dtype(line["x"]["dtype"]))
     np.testing.assert_allclose(x[[0, -1]], [-3, 6], atol=1e-5)
+
+
+def test_the_slider_has_the_camera_of_each_key_frame(run_folder) -> None:
+    add_cameras(run_folder)
+    write_report(run_folder)
+    page = page_of(run_folder)
+    views = json.loads(next(text for text in page.scripts if text.startswith('[{"name"')))
+    assert [view["name"] for view in views] == ["000000", "000020"]
+    assert views[1]["camera"] == [4.0, 1.5, 1.2] and views[1]["driven"].endswith("driven")
+    outline = np.array(views[1]["outline"])
+    assert outline[:, 0].min() > 4 and outline[:, 0].max() == pytest.approx(4 + 8.5, abs=0.01), "ahead, to the range"
+    # The picture shows 12 by 8 m, 600 by 400 pixels of it from its left upper corner (60, 40) on.
+    np.testing.assert_allclose(views[1]["camera_px"], [[(4 + 4) * 50, (5 - 1.5) * 50]], atol=1e-6)
+    assert len(page.all("svg")) == 1 and page.all("input")[0]["max"] == "1"
+    assert (run_folder / "report.html").stat().st_size < 6e6
+
+
+def test_without_cameras_or_place_pictures_still_move(made_run) -> None:
+    page = page_of(made_run)
+    assert json.loads(page.scripts[1]) == [{"name": "000000"}, {"name": "000020"}]
+    assert not page.all("svg") and page.all("input")
+
+
+@settings(max_examples=25)
+@given(st.floats(-60, -40), st.floats(0, 360), st.floats(0.3, 3))
+def test_what_a_camera_sees_of_the_ground(pitch_deg, heading_deg, height_m) -> None:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("zx", [heading_deg, -90 + pitch_deg], degrees=True).as_matrix()
+    T[:3, 3] = 5, -3, height_m + 0.5
+    seen = SeenFrame(np.zeros((48, 64), np.uint8), T, (50.0, 50.0), (31.5, 23.5))
+    outline = ground_outline(seen, 0.5, 1e3)
+    assert (outline[:, 2] == 0.5).all()
+    x, y, z, _ = np.linalg.inv(T) @ np.column_stack([outline, np.ones(len(outline))]).T
+    # Steep enough, every ray meets the ground; what is outlined lies on the border of the image.
+    u, v = 50 * x / z + 31.5, 50 * y / z + 23.5
+    assert (z > 0).all()
+    np.testing.assert_allclose(np.minimum.reduce([u + 0.5, 63.5 - u, v + 0.5, 47.5 - v]), 0, atol=1e-6)
 
 
 def test_optional_parts_are_left_out(run_folder) -> None:
@@ -302,7 +298,7 @@ def test_optional_parts_are_left_out(run_folder) -> None:
     write_report(run_folder)
     page = page_of(run_folder)
     assert not page.all("img")
-    assert "In 3D" in page.text
+    assert "The drive" in page.text
     absent = ("Top-down map", "Key frames", "Skipped frames", "Notes", "Configuration", "frames skipped", "None", "nan")
     assert not [text for text in absent if text in page.text]
     assert page.all("title")

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_runs import add_cameras, make_run
 from PIL import Image
-from test_report import make_run
 
 from jaxmap.labels import ROVER_CLASSES, class_colours
 from jaxmap.report.run_page import write_report
@@ -38,7 +38,16 @@ _PROBE = """
     fetched: performance.getEntriesByType("resource").map((e) => e.name).filter((name) => !/^(data|blob):/.test(name)),
   };
   document.querySelectorAll(".updatemenu-button")[1].dispatchEvent(new MouseEvent("click"));
-  setTimeout(() => { seen.after = mesh(); root.dataset.seen = JSON.stringify(seen); }, 300);
+  const drive = () => ({
+    frame: root.dataset.frame, shown: document.querySelectorAll(".frame:not([hidden])").length,
+    camera: place.data[place.data.length - 1].x[0], above: document.querySelector(".above .camera").getAttribute("cx"),
+  });
+  setTimeout(() => {
+    seen.first = drive();
+    document.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
+    seen.second = drive();
+  }, 200);
+  setTimeout(() => { seen.after = mesh(); root.dataset.seen = JSON.stringify(seen); }, 500);
 })();
 </script>
 """
@@ -69,6 +78,7 @@ def attributes(document: str) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def probed(tmp_path_factory) -> Path:
     run = make_run(tmp_path_factory.mktemp("browser") / "run")
+    add_cameras(run)
     content = write_report(run).read_text(encoding="utf-8")
     page = run / "probed.html"
     page.write_text(content.replace("</body>", f"{_PROBE}</body>"), encoding="utf-8")
@@ -102,6 +112,8 @@ def test_page_loads_draws_and_fetches_nothing(request, visit, ground) -> None:
     assert not seen["before"]["bar"]
     assert seen["after"] == {"bar": "height, m", "faces": seen["before"]["faces"]}
     assert seen["before"]["faces"] > 4000
+    assert seen["first"] == {"frame": "000000", "shown": 1, "camera": -3, "above": "50"}
+    assert seen["second"] == {"frame": "000020", "shown": 1, "camera": 4, "above": "400"}
 
 
 def test_voxels_are_seen_in_their_colours(probed, in_light, tmp_path) -> None:

@@ -93,7 +93,7 @@ def in_a_box(points: np.ndarray, margin_m: float) -> np.ndarray:
 def test_the_ground_is_sand_and_the_boxes_are_rock(finished_run):
     voxels = voxels_of(finished_run)
     z = voxels.centres_world[:, 2]
-    ground = near(voxels) & (np.abs(z) < 0.06) & ~in_a_box(voxels.centres_world, 0.15)
+    ground = near(voxels) & (np.abs(z) < 0.11) & ~in_a_box(voxels.centres_world, 0.15)
     assert ground.sum() > 400
     assert (voxels.label[ground] == SAND).mean() > 0.97
     box = near(voxels) & (z > 0.2) & in_a_box(voxels.centres_world, 0.08)
@@ -110,7 +110,7 @@ def test_files_of_true_labels_label_the_map(cli, scene_folder, tmp_path):
     voxels = voxels_of(tmp_path / "run")
     z = voxels.centres_world[:, 2]
     far_from_boxes = near(voxels) & ~in_a_box(voxels.centres_world, 0.25)
-    assert (voxels.label[far_from_boxes & (np.abs(z) < 0.06)] == SAND).mean() > 0.99
+    assert (voxels.label[far_from_boxes & (np.abs(z) < 0.11)] == SAND).mean() > 0.99
     tops = near(voxels) & (z > 0.2) & in_a_box(voxels.centres_world, 0.08)
     assert (voxels.label[tops] == ROCK).mean() > 0.97
 

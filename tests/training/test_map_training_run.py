@@ -265,3 +265,20 @@ def test_the_command_plans_by_supervision_and_its_errors_name_options_that_exist
     outcome = cli(*words(place, tmp_path / "run", "--mapping.grid.voxel-size-m", "-1"))
     assert outcome.status == 2 and "voxel_size_m is -1.0" in outcome.error
     assert not (tmp_path / "run" / "model.safetensors").exists()
+
+
+@pytest.mark.slow
+def test_observations_give_the_frames_of_their_sequence(cli, place, plan, tmp_path):
+    seen = tmp_path / "seen"
+    assert cli("perceive", place / "sequence", "--out", seen, "--labeller", "none").status == 0
+    config, first = config_of(place), place / "first.safetensors"
+    again = plan_map_training(str(seen), config, first, notify=lambda line: None)
+    assert again.data.digest() == plan.data.digest()
+    for one, other in zip(again.data.train, plan.data.train, strict=True):
+        assert one.name == other.name
+        jax.tree.map(np.testing.assert_array_equal, (one.frame, one.anchors), (other.frame, other.anchors))
+    attributes = json.loads((seen / "observations.zarr" / "zarr.json").read_text())
+    attributes["attributes"]["sequence"] = str(tmp_path / "gone")
+    (seen / "observations.zarr" / "zarr.json").write_text(json.dumps(attributes))
+    with pytest.raises(JaxmapError, match="there is no folder .*gone"):
+        plan_map_training(str(seen), config, first, notify=lambda line: None)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
-from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
+from fixtures import GRID, cli, map_words, scene_folder, shared_cache  # noqa: F401
 from html_tables import tables_of
 from killed import SLOW_DISK, fill_disk, kill_when
 from tune_faults import tune_words, write_truth
@@ -250,3 +250,16 @@ def test_tuned_numbers_go_to_the_options_they_are_of(labeller, own):
     assert (config.relief.bias, config.relief.softness_m) == (-1.5, 0.04)
     assert config.deeplab.temperature == own.get("temperature", 1.0)
     assert config.plane == MapConfig().plane
+
+
+@pytest.mark.slow
+def test_observations_are_tuned_on_as_their_sequence_is(cli, scene_folder, truth, tmp_path):
+    labels = ("--labeller", "files", "--labels", scene_folder / "labels")
+    assert cli("perceive", scene_folder, "--out", tmp_path / "seen", *labels).status == 0
+    told = []
+    for name, source in (("direct", scene_folder), ("seen", tmp_path / "seen")):
+        words = ("tune", source, "--ground-truth", truth, "--out", tmp_path / f"{name}.yaml", *GRID, *SHORT)
+        assert cli(*words, *(labels if name == "direct" else ())).status == 0
+        told.append(json.loads((tmp_path / f"{name}.json").read_text()))
+    assert told[0]["stages"] == told[1]["stages"] and told[0]["before"] == told[1]["before"]
+    assert cli(*map_words(tmp_path / "seen", tmp_path / "run", "--config", tmp_path / "direct.yaml")).status == 0

@@ -1,0 +1,89 @@
+"""`jaxmap export RUN --format colmap`: a run as a COLMAP model with its images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from jaxmap.datasets.registry import open_sequence
+from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.export.colmap import FILES, write_colmap
+from jaxmap.host.bounded_text import read_json, read_yaml
+from jaxmap.host.files import atomic_path
+from jaxmap.report.drive_view import seen_frames
+from jaxmap.report.image_colours import image_colours
+from jaxmap.report.run_contents import read_run
+from jaxmap.runs.config import load_config
+from jaxmap.runs.folder import RunFolder
+from jaxmap.runs.run_frames import read_run_frames
+from jaxmap.stereo.front_end import StereoFrontEnd
+
+IMAGES = "images"
+_QUALITY = 95
+
+
+def export_colmap(folder: RunFolder, notify: Callable[[str], None], advance: Callable[[int, int], None]) -> list[str]:
+    """Writes `RUN/colmap`: the model, and the rectified left images, where the sequence is still at hand.
+
+    Points are the occupied voxels in the colours that the key frames show there.
+
+    Args:
+        folder: of the run.
+        notify: takes lines for the user.
+        advance: is told how many images of how many are written.
+
+    Returns:
+        The names of what was written.
+
+    Raises:
+        JaxmapError: the run has no poses, names or camera, or the disk is full or refuses.
+    """
+    contents, out = read_run(folder.path), folder.path / "colmap"
+    site_origin = np.asarray(contents.attributes.site_origin, np.float64)
+    frames = read_run_frames(folder, site_origin)
+    if frames.camera is None or frames.notes:
+        raise JaxmapError(frames.notes[0], where=folder.path, fix="map again")
+    files = [f"{name}.jpg" for name in frames.names]
+    centres = contents.voxels.centres_world
+    colours = image_colours(centres, [*seen_frames(contents).values()])
+    write_colmap(out, frames.camera, frames.size_px, files, frames.T_world_camera, centres, colours, site_origin)
+    written = [f"{out.name}/{name}" for name in FILES]
+    try:
+        _write_images(folder, set(frames.names), advance)
+    except (JaxmapError, KeyError, TypeError, ValueError) as error:
+        notify(f"note: no images are written ({error}): images.txt names the rectified left ones")
+        return written
+    return [*written, f"{out.name}/{IMAGES}/"]
+
+
+def _write_images(folder: RunFolder, names: set[str], advance: Callable[[int, int], None]) -> None:
+    """Rectifies the left images of a run once more, as it did, and writes them.
+
+    Raises:
+        JaxmapError: the sequence cannot be opened as it was, or the disk is full or refuses.
+    """
+    from PIL import Image
+
+    config, source = load_config(str(folder.config)), str(read_yaml(folder.config)["sequence"])
+    # Only images are wanted: poses that took long to find are not sought again.
+    config = replace(config, poses=folder.poses, poses_world="auto") if str(config.poses) == "odometry" else config
+    sequence = open_sequence(source, config)
+    turn = read_json(folder.metrics)["camera"].get("alignment_rad")
+    front_end = StereoFrontEnd(sequence.camera, config.stereo, None if turn is None else np.array(turn, np.float64))
+    done = 0
+    for frame in sequence.frames:
+        if frame.name not in names:
+            continue
+        try:
+            pair = sequence.read_pair(frame)
+            left, _ = front_end.rectify(pair.left, pair.right)
+        except FrameError as error:
+            raise error.at(f"frame {frame.name}") from error
+        with atomic_path(folder.path / "colmap" / IMAGES / f"{frame.name}.jpg") as temporary:
+            Image.fromarray(left).save(temporary, quality=_QUALITY)
+        done += 1
+        advance(done, len(names))
+    if done < len(names):
+        raise JaxmapError(f"{len(names) - done} of {len(names)} images are gone", where=source)
