@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmap.fusion.params import FusionParams
@@ -30,12 +31,16 @@ _FEWEST_POINTS = 2.0
 _LEAST_WEIGHT = 1e-12
 
 
+AnyArray = Array | np.ndarray
+"""Of JAX or of NumPy."""
+
+
 class Surface(NamedTuple):
     """Heights of the surface, world z, and their standard deviations; both mean nothing where not `known`."""
 
-    height_m: Float[Array, "X Y"]
-    sigma_m: Float[Array, "X Y"]
-    known: Bool[Array, "X Y"]
+    height_m: Float[AnyArray, "X Y"]
+    sigma_m: Float[AnyArray, "X Y"]
+    known: Bool[AnyArray, "X Y"]
 
 
 def height_sigma(cloud: PointCloud, camera_z_m: Float[Array, ""]) -> Float[Array, "N"]:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmap.planning.hazards import Hazards, disc_of, grown, shares
+from jaxmap.planning.hazards import AnyArray, Hazards, disc_of, grown, shares
 from jaxmap.planning.options import RoverOptions
 
 _LEAST_GOODNESS = 0.05
@@ -33,11 +33,11 @@ class CostMap(NamedTuple):
         drivable: where the rover may be.
     """
 
-    cost: Float[Array, "X Y"]
-    goodness: Float[Array, "X Y"]
-    rock: Float[Array, "X Y"]
-    unknown: Float[Array, "X Y"]
-    drivable: Bool[Array, "X Y"]
+    cost: Float[AnyArray, "X Y"]
+    goodness: Float[AnyArray, "X Y"]
+    rock: Float[AnyArray, "X Y"]
+    unknown: Float[AnyArray, "X Y"]
+    drivable: Bool[AnyArray, "X Y"]
 
 
 @partial(jax.jit, static_argnames=("cell_m", "rover"))

@@ -22,15 +22,19 @@ _FLATTEST = 1e-3
 """Least spread of the cells of a disc, as a part of its radius squared: along a line there is no plane."""
 
 
+AnyArray = Array | np.ndarray
+"""Of JAX or of NumPy."""
+
+
 class Heights(NamedTuple):
     """Heights of the ground by cells: x is the first axis, y the second.
 
     `height_m` and its standard deviation `sigma_m` mean nothing where the ground is not `known`.
     """
 
-    height_m: Float[Array, "X Y"]
-    sigma_m: Float[Array, "X Y"]
-    known: Bool[Array, "X Y"]
+    height_m: Float[AnyArray, "X Y"]
+    sigma_m: Float[AnyArray, "X Y"]
+    known: Bool[AnyArray, "X Y"]
 
 
 class Hazards(NamedTuple):
@@ -42,12 +46,12 @@ class Hazards(NamedTuple):
         roughness_m: root mean square of the distances of the cells from the plane.
     """
 
-    step_m: Float[Array, "X Y"]
-    slope_deg: Float[Array, "X Y"]
-    roughness_m: Float[Array, "X Y"]
-    step_sigma_m: Float[Array, "X Y"]
-    slope_sigma_deg: Float[Array, "X Y"]
-    roughness_sigma_m: Float[Array, "X Y"]
+    step_m: Float[AnyArray, "X Y"]
+    slope_deg: Float[AnyArray, "X Y"]
+    roughness_m: Float[AnyArray, "X Y"]
+    step_sigma_m: Float[AnyArray, "X Y"]
+    slope_sigma_deg: Float[AnyArray, "X Y"]
+    roughness_sigma_m: Float[AnyArray, "X Y"]
 
 
 class Disc(NamedTuple):
@@ -85,17 +89,17 @@ def measure_hazards(
         gap_m: distance over which a jump is taken, about the radius of a wheel, static.
         least_share: of the disc's cells that must be known, static.
     """
-    known = heights.known & jnp.isfinite(heights.height_m) & jnp.isfinite(heights.sigma_m)
+    known = jnp.asarray(heights.known) & jnp.isfinite(heights.height_m) & jnp.isfinite(heights.sigma_m)
     z, variance = jnp.where(known, heights.height_m, 0.0), jnp.where(known, heights.sigma_m, 0.0) ** 2
     disc = disc_of(radius_m, cell_m)
     plane = _fit_planes(z, variance, known, disc, cell_m, radius_m)
-    enough = plane.count >= max(least_share * len(disc.cells), _LEAST_CELLS)
-    enough &= plane.determinant > (_FLATTEST * radius_m**2 * plane.count) ** 2
+    enough = plane.cells >= max(least_share * len(disc.cells), _LEAST_CELLS)
+    enough &= plane.determinant > (_FLATTEST * radius_m**2 * plane.cells) ** 2
 
     jumps = _jumps(z, variance, known, plane, enough, disc, cell_m, gap_m)
     square, jump, jump_variance = _over_disc(z, known, plane, disc, cell_m, jumps)
-    freedom = jnp.maximum(plane.count - 3, 1.0)
-    roughness_m = _root(square / plane.count.clip(1))
+    freedom = jnp.maximum(plane.cells - 3, 1.0)
+    roughness_m = _root(square / plane.cells.clip(1))
     tangent = _root(plane.slope_x**2 + plane.slope_y**2)
     # Of a plane through cells of equal variance; the disc is near to round, so it is that of any direction.
     spread = jnp.sqrt(plane.determinant.clip(1e-12))
@@ -134,14 +138,14 @@ def shares(values: Float[Array, "X Y"], disc: Disc) -> Float[Array, "X Y"]:
 class _Planes(NamedTuple):
     """Planes through the known cells of the discs.
 
-    `height_m` is that over the centre of the disc, `determinant` that of the second moments of the cells' places
+    `height_m` is that over the centre of the disc, `cells` how many are known, `determinant` that of the second moments of the cells' places
     (metres to the fourth, times the count squared), `variance` the mean of theirs.
     """
 
     height_m: Array
     slope_x: Array
     slope_y: Array
-    count: Array
+    cells: Array
     determinant: Array
     variance: Array
 
@@ -233,7 +237,7 @@ def _over_disc(
     # Distances are upright to the plane.
     upright = 1 / (1 + plane.slope_x**2 + plane.slope_y**2)
 
-    def add(sums: tuple[Array, ...], offset: Array) -> tuple[tuple[Array, ...], None]:
+    def add(sums: tuple[Array, Array, Array], offset: Array) -> tuple[tuple[Array, Array, Array], None]:
         square, best, noise = sums
         there, height, jump, more = (_shifted(pad, offset, disc.reach, z.shape) for pad in pads)
         x, y = offset[0] * cell_m[0], offset[1] * cell_m[1]

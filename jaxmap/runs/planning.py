@@ -188,17 +188,16 @@ def _along(costs: Costs, places_m: Float[np.ndarray, "S 2"]) -> dict[str, Float[
     site, surface, hazards = costs.attributes.site_origin, costs.ground.surface, costs.hazards
     steps_m = np.linalg.norm(np.diff(places_m, axis=0), axis=1)
     east, north = (places_m + site[:2]).T
+    height_m = np.where(surface.known, np.asarray(surface.height_m, np.float64) + site[2], np.nan)
+    under = {"cost": costs.costs.cost}
+    under |= {name: getattr(hazards, name) for name in ("slope_deg", "step_m", "roughness_m")}
+    under |= {"rock_probability": costs.costs.rock, "unknown": costs.costs.unknown}
     return {
         "east_m": east,
         "north_m": north,
-        "height_m": np.where(surface.known, surface.height_m.astype(np.float64) + site[2], np.nan)[i, j],
+        "height_m": height_m[i, j],
         "distance_m": np.concatenate([[0.0], np.cumsum(steps_m)]),
-        "cost": costs.costs.cost[i, j],
-        "slope_deg": hazards.slope_deg[i, j],
-        "step_m": hazards.step_m[i, j],
-        "roughness_m": hazards.roughness_m[i, j],
-        "rock_probability": costs.costs.rock[i, j],
-        "unknown": costs.costs.unknown[i, j],
+        **{name: np.asarray(values)[i, j] for name, values in under.items()},
     }
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from common import Frames, Table, Traverse, command_line, fuse, jaxmap, parse
@@ -58,7 +58,8 @@ class Truth(NamedTuple):
 def worlds(folder: Path | None, seeds: list[int], known: list[Path]) -> Iterator[Path]:
     """The folders of all worlds; new ones are rendered."""
     yield from known
-    for seed in seeds if folder is not None else ():
+    for seed in seeds:
+        assert folder is not None, "--seeds needs --worlds"
         world = folder / f"{seed}"
         jaxmap("simulate", "--out", world, "--seed", seed, *RENDERING)
         yield world
@@ -72,15 +73,22 @@ def read_truth(gt: Path, grid: GridSpec, plan: Plan) -> Truth:
     east, north = (west, south) + size_m[:2] * grid.shape[:2]
     place = Extent(float(west), float(south), float(east), float(north), crs)
     heights, labels = read_heights(gt / "dem.tif", place), read_window(gt / "orthomosaic_labels.tif", place)
-    x, y = ((np.arange(grid.shape[axis]) + 0.5) * size_m[axis] + (west, south)[axis] for axis in (0, 1))
+    x = west + (np.arange(grid.shape[0]) + 0.5) * size_m[0]
+    y = south + (np.arange(grid.shape[1]) + 0.5) * size_m[1]
     height_m = sample(heights.height_m, heights.T_crs_pixel, x, y, np.nan) - site[2]
     rock = sample(labels.bands[0].astype(float), labels.T_crs_pixel, x, y, 0) == ROCK_LABEL
-    numbered, _ = label(rock, np.ones((3, 3)))
+    numbered, _ = components(rock)
     diameter_m = np.sqrt(np.bincount(numbered.ravel()) * size_m[0] * size_m[1] * 4 / np.pi)
     large = rock & (diameter_m > LEAST_ROCK_M)[numbered]
     known = np.isfinite(height_m)
     surface = Surface(np.nan_to_num(height_m).astype(np.float32), np.zeros(known.shape, np.float32), known)
     return Truth(Ground(surface, large.astype(np.float32), known), large)
+
+
+def components(where: np.ndarray) -> tuple[np.ndarray, int]:
+    """The connected parts of cells, numbered, corners counting as connections; and how many there are."""
+    numbered: Any = label(where, np.ones((3, 3)))
+    return numbered
 
 
 def sample(values: np.ndarray, T_crs_pixel: np.ndarray, x: np.ndarray, y: np.ndarray, outside: float) -> np.ndarray:
@@ -95,7 +103,7 @@ def sample(values: np.ndarray, T_crs_pixel: np.ndarray, x: np.ndarray, y: np.nda
 def draw_pairs(truth: Costs, seen: np.ndarray, near_rock: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
     """Pairs of cells, as places (2, 2) of the map's world."""
     rng, cells = np.random.default_rng(seed), np.argwhere(truth.terrain.drivable & ~near_rock & seen)
-    connected, _ = label(truth.terrain.drivable, np.ones((3, 3)))
+    connected, _ = components(truth.terrain.drivable)
     barred, others = [], []
     for _ in range(4000):
         pair = cells[rng.integers(len(cells), size=2)]
@@ -111,7 +119,8 @@ def draw_pairs(truth: Costs, seen: np.ndarray, near_rock: np.ndarray, count: int
 def ways(frames: Frames, rover: RoverOptions, world: Traverse) -> tuple[dict[str, Costs], np.ndarray]:
     """What driving costs by each way to see the ground, the truth first; and how far true large rocks are, metres."""
     seen_by: dict[str, Costs] = {}
-    frames.plan(BASE)
+    plan = frames.plan(BASE)
+    truth = read_truth(world.gt, plan.grid, plan)
     for name, config in SEEN_BY.items():
         plan = frames.plan(config)
         voxel_map = fuse(plan, frames.prepared)
@@ -119,7 +128,6 @@ def ways(frames: Frames, rover: RoverOptions, world: Traverse) -> tuple[dict[str
         rock = plan.rule.target(voxel_map.classes)
         ground = read_ground(voxel_map, plan.params.fusion, plan.rule, rock)
         if not seen_by:
-            truth = read_truth(world.gt, voxel_map.grid, plan)
             seen_by["truth"] = costs_of(voxel_map, attributes, truth.ground, rover, "rock")
         if name == "ours":
             blind = ground._replace(rock_probability=np.zeros_like(ground.rock_probability))
@@ -171,7 +179,7 @@ def main() -> None:
     for number, folder in enumerate(worlds(given.worlds, given.seeds, given.known)):
         world = Traverse(folder)
         seen_by, far_m = ways(Frames(world.sequence), rover, world)
-        in_view = seen_by["ours"].costs.unknown <= IN_VIEW
+        in_view = np.asarray(seen_by["ours"].costs.unknown) <= IN_VIEW
         pairs = draw_pairs(seen_by["truth"], in_view, far_m < rover.radius_m + rover.margin_m, given.pairs, number)
         for ends in pairs:
             site = seen_by["truth"].attributes.site_origin[:2]
