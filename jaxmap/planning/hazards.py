@@ -138,8 +138,8 @@ def shares(values: Float[Array, "X Y"], disc: Disc) -> Float[Array, "X Y"]:
 class _Planes(NamedTuple):
     """Planes through the known cells of the discs.
 
-    `height_m` is that over the centre of the disc, `cells` how many are known, `determinant` that of the second moments of the cells' places
-    (metres to the fourth, times the count squared), `variance` the mean of theirs.
+    `height_m` is that over the centre of the disc, `cells` how many are known, `determinant` that of the second moments
+    of their places (metres to the fourth, times the count squared), `variance` the mean of theirs.
     """
 
     height_m: Array
