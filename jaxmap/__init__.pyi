@@ -16,7 +16,7 @@ from .geometry.options import GroundOptions
 from .geometry.plane import fit_plane_mlesac, plane_distance
 from .geometry.relief import Relief, relief_channels, relief_of
 from .labellers.base import Labeller, LabellerParams, make_no_labeller
-from .labellers.deeplab import make_deeplab_labeller
+from .labellers.deeplab import make_deeplab_labeller, make_logits_labeller
 from .labellers.files import make_files_labeller
 from .labellers.options import DeeplabOptions, PlaneOptions, ReliefOptions
 from .labellers.plane import make_plane_labeller
@@ -105,6 +105,7 @@ __all__ = [
     "make_files_labeller",
     "make_fusion_params",
     "make_grid",
+    "make_logits_labeller",
     "make_mapper",
     "make_network",
     "make_no_labeller",

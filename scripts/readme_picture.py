@@ -38,9 +38,10 @@ INK, SIZE_PX, DPI = "#222222", (1800, 720), 100
 
 def voxels_in_3d(run: RunContents, width_px: int) -> Image.Image:
     """The occupied voxels in parallel projection, far faces drawn first."""
-    labels = np.asarray(jm.voxel_labels(run.voxel_map, run.params, run.rule))
+    voxel_map = jm.load_map(run.path / "map.zarr")[0]
+    labels = np.asarray(jm.voxel_labels(voxel_map, *run.source.fusion))
     solid = labels != jm.IGNORE
-    origin_m, size_m = np.asarray(run.voxel_map.grid.origin_m), np.asarray(run.voxel_map.grid.voxel_size_m)
+    origin_m, size_m = np.asarray(voxel_map.grid.origin_m), np.asarray(voxel_map.grid.voxel_size_m)
     azimuth, elevation = np.deg2rad([EYE_AZIMUTH_DEG, EYE_ELEVATION_DEG])
     eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -51,7 +52,7 @@ def voxels_in_3d(run: RunContents, width_px: int) -> Image.Image:
         faces = np.argwhere(solid & ~beside)
         square = np.insert([[0, 0], [1, 0], [1, 1], [0, 1]], axis, towards, axis=1)
         corners_m.append(origin_m + (faces[:, None] + square) * size_m)
-        colours.append(class_colours(run.voxel_map.classes)[labels[tuple(faces.T)]] * SHADES[axis])
+        colours.append(class_colours(run.classes)[labels[tuple(faces.T)]] * SHADES[axis])
     corners_m, colours = np.concatenate(corners_m), np.concatenate(colours).astype(int)
     order = np.argsort(corners_m.mean(axis=1) @ eye)
     seen = np.stack([corners_m @ right, -(corners_m @ np.cross(eye, right))], axis=-1)[order]
@@ -90,10 +91,11 @@ def draw(run: RunContents) -> Figure:
     panel(452, 34, 980, 674, title).imshow(voxels_in_3d(run, 980), aspect="equal")
     figure.axes[-1].set_anchor("N")
 
-    grid, top_down = run.voxel_map.grid, jm.top_down(run.voxel_map, run.params, run.rule)
+    voxel_map = jm.load_map(run.path / "map.zarr")[0]
+    grid, top_down = voxel_map.grid, jm.top_down(voxel_map, *run.source.fusion)
     low = np.asarray(grid.origin_m)[:2]
     high = low + np.asarray(grid.voxel_size_m)[:2] * grid.shape[:2]
-    colours = class_colours(run.voxel_map.classes)
+    colours = class_colours(run.classes)
     colours[jm.IGNORE] = 255
     above = panel(1450, 34, 338, 316, "top-down map and path")
     above.imshow(colours[np.asarray(top_down.label).T], origin="lower", extent=(low[0], high[0], low[1], high[1]))

@@ -104,6 +104,7 @@ PRINTED = {
     "docs/architecture.md": r"kitti.*my_rover",
     "docs/fusion_and_tuning.md": r"0\.\d+, d loss / d occupancy_hit 0\.\d+",
     "docs/networks.md": r"\{'sand': .*, 'rock': .*\}\n$",
+    "docs/large_maps.md": r"\d+ voxels observed in 1 blocks of \(2, 2, 2\)",
     "docs/outputs.md": r"\('sand',\) \(2, 2, 2, 2\) None",
 }
 

@@ -21,7 +21,8 @@ from jaxmap.mapping.store import open_map
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.config import config_tree, load_config
 from jaxmap.runs.evaluation import read_cameras
-from jaxmap.runs.folder import RunFolder, write_exports
+from jaxmap.runs.exports import write_exports
+from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.log import RunLog
 
 SEQUENCE_FILES: dict[str, tuple[Change, ...]] = {

@@ -9,6 +9,8 @@ COMMANDS: dict[str, str] = {
     "map": "map a stereo sequence",
     "train": "train or fine-tune DeepLabv3+ on images and masks",
     "refine": "refine poses, camera mounting and stereo calibration until frames agree",
+    "explain": "tell which frames and pixels made a cell of a map",
+    "merge": "add the maps of several sessions",
     "evaluate": "score a map against a labelled orthomosaic",
     "tune": "tune the fusion parameters against ground truth",
     "plan": "plan a path over a map, clear of rocks and hazards",

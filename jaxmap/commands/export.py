@@ -1,4 +1,4 @@
-"""`jaxmap export`: a map in another form."""
+"""`jaxmap export`: a map in other forms."""
 
 from __future__ import annotations
 
@@ -10,20 +10,25 @@ from typing import Literal
 import tyro
 
 from jaxmap.commands.console import Console, parse
+from jaxmap.export.formats import FORMATS, OF_EACH_RUN
 
 
 @dataclass(frozen=True)
 class ExportArguments:
-    """Write the map of a run as PLY (occupied voxels), GeoTIFF (top-down map) or PNG, or the run for COLMAP.
+    """Write the map of a run in forms that other programs read, as docs/formats.md describes them.
 
-    Where the run has an ensemble, the GeoTIFF holds its layers, and a second PNG shows what the map may have missed.
-    For COLMAP and what reads its models, colmap/ holds cameras.txt, images.txt, points3D.txt and the rectified images.
+    Maps of any size are gone through tile by tile. Without --format: PLY (occupied voxels), GeoTIFF (top-down map) and
+    PNG. Where the run has an ensemble, the GeoTIFF holds its layers, and a second PNG shows what the map may have
+    missed. For COLMAP and what reads its models, colmap/ holds cameras.txt, images.txt, points3D.txt and the rectified
+    images.
     """
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
-    format: Literal["ply", "geotiff", "png", "colmap", "all"] = "all"
-    """What to write; all are the first three."""
+    format: tuple[Literal[(*FORMATS, "colmap")], ...] = OF_EACH_RUN  # pyright: ignore[reportInvalidTypeForm]
+    """What to write; several at once are separated by spaces."""
+    colours: Literal["classes", "images"] = "classes"
+    """Colours of points and surfaces: of their classes, or of the run's key frames."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -31,18 +36,21 @@ def main(words: Sequence[str]) -> int:
     arguments = parse(ExportArguments, "export", words)
 
     from jaxmap.mapping.store import open_map
-    from jaxmap.runs.folder import EXPORTS, RunFolder, write_exports
+    from jaxmap.runs.exports import write_exports
+    from jaxmap.runs.folder import RunFolder
 
-    folder = RunFolder(arguments.run)
+    folder, console = RunFolder(arguments.run), Console()
     folder.settle_for_reading()
-    console = Console()
-    if arguments.format == "colmap":
+    formats = [form for form in arguments.format if form != "colmap"]
+    written: list[str] = []
+    if formats:
+        with console.steps("exporting", "forms", len(formats)) as advance:
+            options = dict(colours=arguments.colours, notify=console.notify, advance=advance)
+            written += write_exports(folder, open_map(folder.map), formats, **options)
+    if "colmap" in arguments.format:
         from jaxmap.runs.colmap import export_colmap
 
         with console.counted("images", "images") as count:
-            written = export_colmap(folder, console.notify, count)
-        console.result(arguments.run, written)
-        return 0
-    formats = tuple(EXPORTS) if arguments.format == "all" else (arguments.format,)
-    console.result(arguments.run, write_exports(folder, open_map(folder.map), formats))
+            written += export_colmap(folder, console.notify, count)
+    console.result(arguments.run, written)
     return 0

@@ -8,7 +8,7 @@ prior as its probability: a few stray points do not make a cell.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,11 @@ from jaxmap.errors import JaxmapError
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.types import GridSpec
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
 MAX_CELLS = 2**26
+_MOST_DENSE = 2**24
 _SNAP = 1e-6
 """Areas closer than this, in cells, are the same: sums of fractions such as 0.2 / 3 are not exact."""
 
@@ -50,11 +54,11 @@ class ColumnShares(NamedTuple):
     """How much of each column of voxels lies in each cell, as a share of the column's width along each axis.
 
     The share of its area is the product of the two. `columns_per_cell` is how many columns fill a cell, whole or in
-    part.
+    part. Of many columns the matrices are sparse: a cell holds but a few.
     """
 
-    x: Float[np.ndarray, "I X"]
-    y: Float[np.ndarray, "J Y"]
+    x: Float[np.ndarray, "I X"] | csr_array
+    y: Float[np.ndarray, "J Y"] | csr_array
     columns_per_cell: float
 
 
@@ -98,6 +102,8 @@ def make_cells(grid: GridSpec, size_m: float) -> CellGrid:
 
 def column_shares(grid: GridSpec, cells: CellGrid) -> ColumnShares:
     """How the columns of a map fall into cells."""
+    if grid.shape[0] * grid.shape[1] > _MOST_DENSE:
+        return _sparse_shares(grid, cells)
     origin_m, voxel_m = exact_corner(grid)
     shares = []
     for axis in (0, 1):
@@ -108,8 +114,30 @@ def column_shares(grid: GridSpec, cells: CellGrid) -> ColumnShares:
     return ColumnShares(*shares, columns_per_cell=float(np.prod(cells.size_m / voxel_m[:2])))
 
 
+def _sparse_shares(grid: GridSpec, cells: CellGrid) -> ColumnShares:
+    """`column_shares`, with only the cells that a column touches; a cell is larger than a column, or the map small."""
+    from scipy.sparse import csr_array
+
+    origin_m, voxel_m = exact_corner(grid)
+    shares = []
+    for axis in (0, 1):
+        low = origin_m[axis] + np.arange(grid.shape[axis]) * voxel_m[axis] - cells.origin_m[axis]
+        reach = int(np.ceil(voxel_m[axis] / cells.size_m)) + 1
+        cell = np.floor(low / cells.size_m - _SNAP).astype(int)[:, None] + np.arange(reach + 1)
+        edge = cell * cells.size_m
+        within = np.minimum(edge + cells.size_m, low[:, None] + voxel_m[axis]) - np.maximum(edge, low[:, None])
+        share = np.round(within.clip(min=0) / voxel_m[axis], 6).astype(np.float32)
+        there = (share > 0) & (cell >= 0) & (cell < cells.shape[axis])
+        column = np.broadcast_to(np.arange(grid.shape[axis])[:, None], cell.shape)
+        shape = (cells.shape[axis], grid.shape[axis])
+        shares.append(csr_array((share[there], (cell[there], column[there])), shape=shape))
+    return ColumnShares(*shares, columns_per_cell=float(np.prod(cells.size_m / voxel_m[:2])))
+
+
 def area_in_cells(shares: ColumnShares, columns: Float[AnyArray, "X Y"]) -> Float[Array, "I J"]:
     """The sum over the columns of each cell, weighted by the share of their area that lies in it."""
+    if not isinstance(shares.x, np.ndarray):
+        return jnp.asarray(shares.x @ np.asarray(columns, np.float32) @ shares.y.T)
     # The default precision of accelerators would round the counts.
     along_x = jnp.matmul(shares.x, columns, precision="highest")
     return jnp.matmul(along_x, shares.y.T, precision="highest")

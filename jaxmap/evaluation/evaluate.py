@@ -72,10 +72,15 @@ class ClassLayer:
     @property
     def place(self) -> Extent:
         """The extent of the grid in `crs`."""
-        origin_m, voxel_m = exact_corner(self.grid)
-        low = np.asarray(self.site_origin, np.float64)[:2] + origin_m[:2]
-        high = low + voxel_m[:2] * self.grid.shape[:2]
-        return Extent(float(low[0]), float(low[1]), float(high[0]), float(high[1]), self.crs)
+        return place_of(self.grid, self.site_origin, self.crs)
+
+
+def place_of(grid: GridSpec, site_origin: Float64[np.ndarray, "3"], crs: str | None) -> Extent:
+    """The extent of a grid in the system of its site."""
+    origin_m, voxel_m = exact_corner(grid)
+    low = np.asarray(site_origin, np.float64)[:2] + origin_m[:2]
+    high = low + voxel_m[:2] * grid.shape[:2]
+    return Extent(float(low[0]), float(low[1]), float(high[0]), float(high[1]), crs)
 
 
 class Evaluation(NamedTuple):

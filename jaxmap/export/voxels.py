@@ -38,10 +38,15 @@ def occupied_voxels(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule)
     channel = np.where(unlabelled, 0, label.astype(np.intp) + 1)
     prior = np.append(np.asarray(params.occupancy_prior), np.asarray(params.class_prior)).astype(np.float32)
     log_odds = np.asarray(voxel_map.log_odds)[(channel, *at)] + prior[channel]
-    size_m = np.asarray(voxel_map.grid.voxel_size_m)
+    grid = voxel_map.grid
+    size_m = np.asarray(grid.voxel_size_m)
+    # Counted along the lattice: a voxel's centre is the same number in any block of the map.
+    centres = (
+        np.asarray(grid.lattice_m) + (index + np.asarray(grid.first) + np.float32(0.5)).astype(np.float32) * size_m
+    )
     return OccupiedVoxels(
         index=index,
-        centres_world=((index + np.float32(0.5)) * size_m + np.asarray(voxel_map.grid.origin_m)).astype(np.float32),
+        centres_world=centres.astype(np.float32),
         label=label,
         probability=_sigmoid(log_odds),
         voxel_size_m=size_m,

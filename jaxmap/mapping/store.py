@@ -135,6 +135,10 @@ def _opened(target: Path) -> tuple[Path, dict[str, zarr.Array], dict[str, Any]]:
     return folder, *open_group(folder, target)
 
 
+Columns = tuple[slice, slice]
+"""A rectangle of columns of a grid, along x and y."""
+
+
 class Block(NamedTuple):
     """A dense part of a map: columns of full height, with a margin of others around them.
 
@@ -145,7 +149,7 @@ class Block(NamedTuple):
     """
 
     voxel_map: VoxelMap
-    own: tuple[slice, slice]
+    own: Columns
     corner: tuple[int, int]
 
 
@@ -158,22 +162,43 @@ class MapReader:
         classes: its classes.
         frames_fused: how many frames it holds.
         attributes: what is stored beside it.
-        blocks: `(margin=0) -> Iterator[Block]`, blocks that together hold all that was observed, each column once, with
-            as many columns around them.
+        places: where its blocks lie in the grid; what lies in none was not observed.
+        blocks: `(margin=0, within=None) -> Iterator[Block]`, blocks that together hold all that was observed, each
+            column once, with as many columns around them; of those only the ones that touch the columns `within`.
     """
 
     grid: GridSpec
     classes: tuple[str, ...]
     frames_fused: int
     attributes: MapAttributes
+    places: tuple[Columns, ...]
     blocks: Callable[..., Iterator[Block]]
+
+    def extent(self) -> Columns:
+        """The smallest rectangle that holds all blocks; the whole grid where there is none."""
+        if not self.places:
+            return slice(0, self.grid.shape[0]), slice(0, self.grid.shape[1])
+        x, y = (
+            slice(min(part.start for part in along), max(part.stop for part in along))
+            for along in zip(*self.places, strict=True)
+        )
+        return x, y
 
 
 def in_memory(voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
     """A map that is in memory as one block."""
-    everything = Block(voxel_map, (slice(None), slice(None)), (0, 0))
+    whole = slice(0, voxel_map.grid.shape[0]), slice(0, voxel_map.grid.shape[1])
     count = int(voxel_map.frames_fused)
-    return MapReader(voxel_map.grid, voxel_map.classes, count, attributes, lambda margin=0: iter([everything]))
+
+    def blocks(margin: int = 0, within: Columns | None = None) -> Iterator[Block]:
+        yield Block(voxel_map, whole, (0, 0))
+
+    return MapReader(voxel_map.grid, voxel_map.classes, count, attributes, (whole,), blocks)
+
+
+def touch(one: Columns, other: Columns) -> bool:
+    """Whether two rectangles share a column."""
+    return all(a.start < b.stop and b.start < a.stop for a, b in zip(one, other, strict=True))
 
 
 def open_map(path: str | os.PathLike[str]) -> MapReader:
@@ -189,22 +214,28 @@ def open_map(path: str | os.PathLike[str]) -> MapReader:
     check_kind(array, LOG_ODDS, (1 + len(classes), *grid.shape), stored.get("chunks_stored"), target)
     _read_layers(arrays, stored, grid, attributes, target)
 
-    def blocks(margin: int = 0) -> Iterator[Block]:
-        edge = array.chunks[1:3]
-        for tile in sorted({tile[1:3] for tile in stored_chunks(folder / LOG_ODDS)}):
-            low = [index * size for index, size in zip(tile, edge, strict=True)]
-            high = [min(start + size, most) for start, size, most in zip(low, edge, grid.shape, strict=False)]
+    edge = array.chunks[1:3]
+    places = tuple(
+        (slice(x, min(x + edge[0], grid.shape[0])), slice(y, min(y + edge[1], grid.shape[1])))
+        for x, y in sorted({(tile[1] * edge[0], tile[2] * edge[1]) for tile in stored_chunks(folder / LOG_ODDS)})
+    )
+
+    def blocks(margin: int = 0, within: Columns | None = None) -> Iterator[Block]:
+        for place in places:
+            if within is not None and not touch(place, within):
+                continue
             around = [
-                slice(max(a - margin, 0), min(b + margin, n)) for a, b, n in zip(low, high, grid.shape, strict=False)
+                slice(max(own.start - margin, 0), min(own.stop + margin, size))
+                for own, size in zip(place, grid.shape, strict=False)
             ]
             log_odds = read_part(array, (slice(None), *around), target)
             first = np.asarray(grid.first) + np.array([around[0].start, around[1].start, 0])
             part = replace(grid, first=to_device(first, np.int32), shape=log_odds.shape[1:])
-            x, y = (slice(a - s.start, b - s.start) for a, b, s in zip(low, high, around, strict=True))
+            x, y = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(place, around, strict=True))
             voxel_map = VoxelMap(jnp.asarray(log_odds), to_device(frames_fused, np.int32), part, classes)
-            yield Block(voxel_map, (x, y), (low[0], low[1]))
+            yield Block(voxel_map, (x, y), (place[0].start, place[1].start))
 
-    return MapReader(grid, classes, frames_fused, attributes, blocks)
+    return MapReader(grid, classes, frames_fused, attributes, places, blocks)
 
 
 def _read_layers(

@@ -117,12 +117,13 @@ class TileStore:
                 fix="map it anew with --overwrite",
             )
         self._next = self._array(self._waiting)
+        # Listed once: a map of kilometres has tens of thousands.
+        self._there: set[Tile] = {(x, y, z) for _, x, y, z in stored_chunks(array_folder(self._committed))}
         self._removed: set[Tile] = set()
 
     def tiles(self) -> set[Tile]:
         """The tiles that are there, waiting ones among them."""
-        there = stored_chunks(array_folder(self._committed)) + stored_chunks(array_folder(self._next))
-        return {(x, y, z) for _, x, y, z in there} - self._removed
+        return set(self._there)
 
     def read(self, tile: Tile) -> Float32[np.ndarray, "K X Y Z"] | None:
         """What was last written of a tile; None where that is nothing.
@@ -130,12 +131,10 @@ class TileStore:
         Raises:
             JaxmapError: it is damaged.
         """
-        if tile in self._removed:
+        if tile not in self._there:
             return None
-        for array in (self._next, self._committed):
-            if _chunk_file(array, tile).exists():
-                return read_part(array, _part(tile), self.path)
-        return None
+        waits = _chunk_file(self._next, tile).exists()
+        return read_part(self._next if waits else self._committed, _part(tile), self.path)
 
     def write(self, tile: Tile, log_odds: Float32[np.ndarray, "K X Y Z"]) -> None:
         """Writes a tile, to be part of the map with the next commit; one of nothing but zeros is removed.
@@ -150,8 +149,11 @@ class TileStore:
             raise write_error(error, self.path) from error
         if log_odds.any():
             self._removed.discard(tile)
-        elif _chunk_file(self._committed, tile).exists():
-            self._removed.add(tile)
+            self._there.add(tile)
+        else:
+            self._there.discard(tile)
+            if _chunk_file(self._committed, tile).exists():
+                self._removed.add(tile)
 
     def commit(self, frames_fused: int, attributes: MapAttributes) -> None:
         """Makes the waiting tiles part of the map, with the attributes, all at once.
@@ -160,7 +162,7 @@ class TileStore:
             JaxmapError: the disk refuses; the map is that of the commit before.
         """
         stored = to_json(self.grid, self.classes, frames_fused, attributes)
-        stored["chunks_stored"] = len(self.tiles())
+        stored["chunks_stored"] = len(self._there)
         record = {"attributes": stored, "removed": sorted(self._removed)}
         try:
             for parent, _, names in os.walk(self._waiting):
@@ -171,6 +173,8 @@ class TileStore:
                 temporary.write_text(json.dumps(record), "utf-8")
             self._apply(record)
             self._record.unlink()
+            # The folders that the tiles have left would be gone through at each commit to come.
+            shutil.rmtree(array_folder(self._next) / "c", ignore_errors=True)
         except OSError as error:
             raise write_error(error, self.path) from error
         self._removed.clear()
@@ -200,15 +204,19 @@ class TileStore:
         import zarr
 
         waiting, committed = self._array(self._waiting), self._array(self.path)
+        changed = {self.path}
         for _, *tile in stored_chunks(array_folder(waiting)):
             target = _chunk_file(committed, tile)
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(_chunk_file(waiting, tile), target)
+            changed.update(target.parents[: len(tile) + 2])
         for tile in record["removed"]:
             _chunk_file(committed, tile).unlink(missing_ok=True)
+            changed.add(_chunk_file(committed, tile).parent)
         zarr.open_group(self.path, mode="r+", zarr_format=3).update_attributes(record["attributes"])
-        for parent, _, _ in os.walk(self.path):
-            sync(Path(parent))
+        sync(self.path / "zarr.json")
+        for folder in changed:
+            sync(folder)
 
 
 class MovingBlock:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -99,13 +98,6 @@ def map_layers(voxel_map: VoxelMap, params: FusionParams) -> dict[str, Float[np.
         return {}
     around = read_surface(voxel_map, params, reach=_reach(cell_m))
     return ground_layers(read_surface(voxel_map, params), hazards_of(around, cell_m, rover))
-
-
-def absolute_layers(
-    layers: Mapping[str, Float[np.ndarray, "X Y"]], site_z_m: float
-) -> dict[str, Float[np.ndarray, "X Y"]]:
-    """The layers with heights in the coordinate reference system of the site."""
-    return {name: values + site_z_m if name == SURFACE_LAYER else values for name, values in layers.items()}
 
 
 def _reach(cell_m: tuple[float, float]) -> int:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 STAGES = (
-    *("project", "transform", "mlesac", "plane_labels", "network", "pixel_labels"),
+    *("project", "transform", "relief", "mlesac", "plane_labels", "network", "pixel_labels"),
     *("view_window", "carve", "count_points", "frame_evidence", "add_evidence", "fuse_members"),
 )
 """The named scopes of the step, in its order."""

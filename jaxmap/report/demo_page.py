@@ -7,13 +7,12 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import UInt8
 
 from jaxmap.evaluation.evaluate import Evaluation
-from jaxmap.fusion.query import TopDown, top_down
 from jaxmap.labels import class_colours
+from jaxmap.mapping.columns import top_down_of
 from jaxmap.report.drive_view import drive_section
 from jaxmap.report.error_map import verdict_colours, write_error_map, write_truth_map
 from jaxmap.report.page import figure, header, inline_image, section, table, write_page
@@ -49,11 +48,12 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
     """
     last = runs[-1]
     shown = read_run(out / str(last.row["run"]))
-    top: TopDown = jax.tree.map(np.asarray, top_down(shown.voxel_map, shown.params, shown.rule))
-    box_m = map_sheet(np.zeros((0, 0, 3)), top, shown.voxel_map.grid, shown.trajectory_world, legend=()).box_m
+    grid = shown.reader.grid
+    top = top_down_of(shown.reader, *shown.source.fusion, (slice(0, grid.shape[0]), slice(0, grid.shape[1])))
+    box_m = map_sheet(np.zeros((0, 0, 3)), top, grid, shown.trajectory_world, legend=()).box_m
     look: dict[str, Any] = dict(box_m=box_m, layout=HALF)
-    names = (shown.voxel_map.classes, shown.trajectory_world)
-    top_down_picture(top, shown.voxel_map.grid, *names, out / "map.png", layout=HALF)
+    names = (shown.classes, shown.trajectory_world)
+    top_down_picture(top, grid, *names, out / "map.png", layout=HALF)
     write_truth_map(out / "truth.png", last.evaluation, last.backdrop, **look)
     errors, verdicts = "", {}
     for run in runs:
@@ -63,11 +63,11 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
         verdicts |= verdict_colours(run.evaluation)
     above = _picture(out / "map.png", "Top-down map", f"The map ({escape(str(last.row['map']))}) and the rover's path")
     above += _picture(out / "truth.png", "Ground truth", "Orthomosaic, at another time of day, with the true rocks")
-    classes = shown.voxel_map.classes
+    classes = shown.classes
     there = {name: class_colours(classes)[index] for index, name in enumerate(classes) if (top.label == index).any()}
     bodies = [
         _head(title, columns, shown, last.row),
-        drive_section(shown),
+        drive_section(shown, out / "report.html"),
         section(
             "Map and ground truth",
             _legend(there | {"not observed": UNOBSERVED_COLOUR}) + f'<div class="pairs">{above}</div>',
@@ -80,7 +80,7 @@ def write_demo_page(out: Path, title: str, columns: Mapping[str, str], runs: Seq
 
 def _head(title: str, columns: Mapping[str, str], shown: RunContents, row: Row) -> str:
     lead = (
-        f"{int(shown.voxel_map.frames_fused)} stereo frames and the rover's poses become a 3D semantic voxel map: by "
+        f"{shown.reader.frames_fused} stereo frames and the rover's poses become a 3D semantic voxel map: by "
         "the two labellers of Chiodini et al. (2020) under their fusion rule, and by jaxmap's own. Each map is scored "
         "against a labelled orthomosaic."
     )

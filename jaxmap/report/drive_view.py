@@ -6,7 +6,9 @@ import base64
 import gzip
 import io
 import json
+from collections.abc import Mapping
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from jaxtyping import Float
 
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.pictures import open_picture
+from jaxmap.report.detail import detail_section
 from jaxmap.report.image_colours import SeenFrame, image_colours
 from jaxmap.report.page import figure, inline_image, script_text, section
 from jaxmap.report.run_contents import PICTURES, RunContents
@@ -29,14 +32,17 @@ _SIDE_POINTS = 9
 _RAISED_M = 0.05
 
 
-def drive_section(contents: RunContents) -> str:
-    """The section of the drive; a page holds one at most. What cannot be read is left out, with a remark."""
+def drive_section(contents: RunContents, page: Path) -> str:
+    """The section of the drive; a page holds one at most. What cannot be read is left out, with a remark.
+
+    A map that is too large for one view has a section more, of its parts in detail, which may lie beside the page.
+    """
     rows = {frame: row for frame in _chosen(contents) if (row := key_frame_row(contents, frame))}
-    seen = seen_frames(contents)
+    seen = seen_frames(contents.pictures, contents.group("camera"))
     around = _map_from_above(contents)
-    parts = _in_3d(contents, seen)
+    parts, merged = _in_3d(contents, seen)
     if around:
-        parts = f'<div class="stage">{parts}{around[0]}</div>'
+        parts = f'<div class="stage">{parts}{_from_above(around[0])}</div>'
     shown = "".join(f'<div class="frame"><h3>Frame {escape(name)}</h3>{row}</div>' for name, row in rows.items())
     if len(rows) > 1:
         views = [_view(contents, name, seen.get(name), around and around[1]) for name in rows]
@@ -50,7 +56,8 @@ def drive_section(contents: RunContents) -> str:
         parts += f'<div class="frames">{shown}</div>'
     if len(rows) < len(contents.pictures):
         parts += f"<p>{len(rows)} of {len(contents.pictures)} key frames.</p>"
-    return section("The drive", f'<div id="drive">{parts}</div>')
+    detail = detail_section(contents.source, page, *around) if around and merged > 1 else ""
+    return section("The drive", f'<div id="drive">{parts}</div>') + detail
 
 
 def _chosen(contents: RunContents) -> list[str]:
@@ -61,23 +68,25 @@ def _chosen(contents: RunContents) -> list[str]:
     return frames
 
 
-def _in_3d(contents: RunContents, seen: dict[str, SeenFrame]) -> str:
-    """The interactive view, with its caption."""
+def _in_3d(contents: RunContents, seen: dict[str, SeenFrame]) -> tuple[str, int]:
+    """The interactive view with its caption, and how many voxels along an edge it draws as one."""
     if not len(contents.voxels.label):
-        return "<p>No voxel is occupied.</p>"
+        return "<p>No voxel is occupied.</p>", 1
     frames = list(seen.values())
     view = voxel_view(
         contents.voxels,
-        contents.voxel_map.classes,
+        contents.classes,
         contents.trajectory_world,
         (lambda points_world: image_colours(points_world, frames)) if frames else None,
+        merged=contents.merged,
+        count=contents.occupied,
     )
     return (
         '<figure class="in3d"><div id="view3d" class="view3d" role="figure" '
         f'aria-label="Occupied voxels of {escape(contents.name)} in 3D, to turn by dragging"></div>'
         f"<figcaption>{escape(view.caption)} Drag to turn, scroll to zoom.</figcaption></figure>"
         f'<script type="text/plain" id="view3d-data">{_packed(str(view.figure.to_json()))}</script>'
-    )
+    ), view.merged
 
 
 def _packed(text: str) -> str:
@@ -85,13 +94,17 @@ def _packed(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode("ascii")
 
 
-def seen_frames(contents: RunContents) -> dict[str, SeenFrame]:
-    """The key frames with their cameras, by name; those that are not whole are left out."""
-    frames, camera = {}, contents.group("camera")
-    poses = camera.get("key_frames")
+def seen_frames(pictures: Mapping[str, Mapping[str, Path]], camera: Mapping[str, Any]) -> dict[str, SeenFrame]:
+    """The key frames with their cameras, by name; those that are not whole are left out.
+
+    Args:
+        pictures: of `find_pictures`.
+        camera: that of `metrics.json`.
+    """
+    frames, poses = {}, camera.get("key_frames")
     for name, pose in poses.items() if isinstance(poses, dict) else ():
         try:
-            with open_picture(contents.pictures[name]["left"]) as image:
+            with open_picture(pictures[name]["left"]) as image:
                 pixels = np.asarray(image)
             # Most pictures are smaller than the images that the camera is of.
             share = pixels.shape[1] / camera["width_px"]
@@ -137,14 +150,18 @@ def _map_from_above(contents: RunContents) -> tuple[str, Float[np.ndarray, "3 3"
     image.save(buffer, "webp", quality=86)
     data = base64.b64encode(buffer.getvalue()).decode("ascii")
     svg = (
-        f'<figure class="above"><svg viewBox="0 0 {image.width} {image.height}" role="img" '
-        'aria-label="The map from above, with what the camera sees"><image '
-        f'href="data:image/webp;base64,{data}" width="{image.width}" height="{image.height}"/>'
-        '<path class="seen"/><circle class="camera" r="0"/></svg>'
-        "<figcaption>From above, north up; outlined, the ground that the camera has in its image.</figcaption></figure>"
+        f'<svg viewBox="0 0 {image.width} {image.height}" role="img" aria-label="The map from above"><image '
+        f'href="data:image/webp;base64,{data}" width="{image.width}" height="{image.height}"/></svg>'
     )
     sx, sy = (per_m * share).tolist()
     return svg, np.array([[sx, 0, -west * sx], [0, -sy, north * sy], [0, 0, 1]])
+
+
+def _from_above(svg: str) -> str:
+    """The map with what drive.js moves over it."""
+    moved = '<path class="seen"/><circle class="camera" r="0"/></svg>'
+    caption = "From above, north up; outlined, the ground that the camera has in its image."
+    return f'<figure class="above">{svg.replace("</svg>", moved)}<figcaption>{caption}</figcaption></figure>'
 
 
 def _view(

@@ -26,40 +26,41 @@ THEME = {INK: "--ink", QUIET: "--quiet", LINE: "--line", ACCENT: "--accent", BAR
 """Their CSS variables."""
 
 
-def page(title: str, body: str, *, drawn: bool) -> str:
+def page(title: str, body: str, *, drawn: bool, beside: bool = False) -> str:
     """A whole page.
 
     Args:
         title: its title, escaped here.
         body: its HTML.
         drawn: whether the body holds a 3D view.
+        beside: whether there are scripts in a folder beside it that it may read, and nothing else.
     """
-    scripts = ""
+    scripts, policy = "", f"{_POLICY} 'self' file:" if beside else _POLICY
     if drawn:
         from plotly.offline import get_plotlyjs
 
         scripts = f"<script>{get_plotlyjs()}</script>"
     style, *code = (
         files("jaxmap.report").joinpath(name).read_text(encoding="utf-8")
-        for name in ("page.css", "page.js", "drive.js")
+        for name in ("page.css", "page.js", "drive.js", "detail.js")
     )
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)} · jaxmap</title>\n<style>{style}</style>\n</head>\n"
         f"<body>\n<main>{body}</main>\n{scripts}\n<script>{''.join(code)}</script>\n</body>\n</html>\n"
     )
 
 
-def write_page(path: Path, title: str, body: str, *, drawn: bool) -> Path:
+def write_page(path: Path, title: str, body: str, *, drawn: bool, beside: bool = False) -> Path:
     """Writes a page, atomically, and returns its path.
 
     Raises:
         JaxmapError: the disk is full or refuses.
     """
     with atomic_path(path) as temporary:
-        temporary.write_text(page(title, body, drawn=drawn), encoding="utf-8", errors="backslashreplace")
+        temporary.write_text(page(title, body, drawn=drawn, beside=beside), encoding="utf-8", errors="backslashreplace")
     return path
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
-
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import YAML_BOUNDS, read_text
 from jaxmap.labels import class_colours
+from jaxmap.report.detail import FOLDER
 from jaxmap.report.drive_view import drive_section
 from jaxmap.report.page import figure, header, notes_section, paper, section, table, write_page
 from jaxmap.report.run_contents import RunContents, read_run
@@ -47,6 +47,8 @@ def write_report(run: Path) -> Path:
     """
     contents = read_run(Path(run))
     path, metrics, remarks = contents.path, contents.metrics, contents.remarks
+    page = path / "report.html"
+    shutil.rmtree(path / FOLDER, ignore_errors=True)
     skipped, notes = (contents.group("sequence").get(key) for key in ("skipped", "notes"))
     rows = [
         (value_text(entry.get("frame")), value_text(entry.get("reason")))
@@ -63,7 +65,7 @@ def write_report(run: Path) -> Path:
     )
     body = [
         _header(contents),
-        drive_section(contents),
+        drive_section(contents, page),
         section("Top-down map", paper(path / "bev.png", f"Top-down map of {contents.name}", remarks)),
         missed_section(path, metrics, remarks),
         map_score_section(path, remarks),
@@ -75,7 +77,8 @@ def write_report(run: Path) -> Path:
         section("Files", f'<ul class="files">{links}</ul>'),
         f"<footer>Made by jaxmap{f' {escape(str(version))}' if version else ''}.</footer>",
     ]
-    return write_page(path / "report.html", contents.name, "".join(body), drawn=len(contents.voxels.label) > 0)
+    beside = (path / FOLDER).is_dir()
+    return write_page(page, contents.name, "".join(body), drawn=contents.occupied > 0, beside=beside)
 
 
 def _settings(config: Path, remarks: list[str]) -> str:
@@ -90,7 +93,7 @@ def _settings(config: Path, remarks: list[str]) -> str:
 
 
 def _header(contents: RunContents) -> str:
-    metrics, sequence, voxels = contents.metrics, contents.group("sequence"), contents.voxels
+    metrics, sequence = contents.metrics, contents.group("sequence")
     facts = [
         sequence.get("dataset"),
         f"labels: {metrics['labeller']}" if metrics.get("labeller") else None,
@@ -102,15 +105,15 @@ def _header(contents: RunContents) -> str:
         numbers = {key: value for key, value in progress.items() if isinstance(value, int) and key != "complete"}
         done = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in numbers.items())
         banner = f"This run was interrupted{f' ({done})' if done else ''}: the map is of its first part."
-    area_m2 = len(np.unique(voxels.index[:, :2], axis=0)) * float(np.prod(voxels.voxel_size_m[:2].astype(np.float64)))
+    area_m2 = contents.area_m2
     peak_mib, skipped = contents.group("memory").get("peak_resident_mib"), sequence.get("skipped")
     length_m, rate = sequence.get("path_length_m"), contents.group("times").get("frames_per_s")
     stats: list[tuple[str, str | None]] = [
-        ("frames fused", value_text(int(contents.voxel_map.frames_fused))),
+        ("frames fused", value_text(contents.reader.frames_fused)),
         ("frames skipped", value_text(len(skipped)) if isinstance(skipped, list) else None),
         ("path", value_text(round(float(length_m), 1), "m") if isinstance(length_m, int | float) else None),
         ("area observed", value_text(round(area_m2) if area_m2 >= 100 else area_m2, "m²")),
-        ("occupied voxels", value_text(len(voxels.label))),
+        ("occupied voxels", value_text(contents.occupied)),
         ("frames/s", value_text(float(rate)) if isinstance(rate, int | float) else None),
     ]
     if isinstance(peak_mib, int | float):
@@ -160,7 +163,7 @@ def _metric_tables(contents: RunContents) -> str:
         if rows:
             wide += figure(table(("Stage", "median, ms", "95 %, ms", "total, s", ""), rows), "Stages")
     if isinstance(by_class, dict) and by_class:
-        wide += _class_table(by_class, contents.voxel_map.classes)
+        wide += _class_table(by_class, contents.classes)
     groups = {key: metrics[key] for key in dict.fromkeys((*_GROUPS, *metrics)) if isinstance(metrics.get(key), dict)}
     groups["other"] = {key: value for key, value in metrics.items() if key not in (*_GROUPS, *groups)}
     cards = ""

@@ -15,7 +15,7 @@ from jaxmap.report.wording import value_text
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-MAX_FACES = 100_000
+MAX_FACES, _PATH_POINTS = 100_000, 5000
 _PALETTE = 64
 """Colours that are left of the images': one number a face, where colours would be text."""
 
@@ -36,24 +36,27 @@ def exposed_faces(index: Int[np.ndarray, "N 3"], *, undersides: bool = True) -> 
     index = np.asarray(index, np.int64).reshape(-1, 3)
     low = index.min(axis=0, initial=np.iinfo(np.int32).max) - 1
     local = index - low
-    solid = np.zeros(local.max(axis=0, initial=0) + 2, bool)
-    solid[tuple(local.T)] = True
+    shape = tuple((local.max(axis=0, initial=0) + 2).tolist())
+    # Looked up by their numbers: an array of all voxels between those of a long drive would fill the memory.
+    solid = np.sort(np.ravel_multi_index(tuple(local.T), shape))
     corners, voxels = [], []
     for axis in range(3):
         for side in (0, 1):
             if (axis, side) == (2, 0) and not undersides:
                 continue
             step = (2 * side - 1) * np.eye(3, dtype=np.int64)[axis]
-            voxel = np.flatnonzero(~solid[tuple((local + step).T)])
+            beside = np.ravel_multi_index(tuple((local + step).T), shape)
+            at = np.searchsorted(solid, beside).clip(max=len(solid) - 1)
+            voxel = np.flatnonzero(solid[at] != beside) if len(solid) else np.zeros(0, np.int64)
             square = np.insert(_SQUARE, axis, side, axis=1)
             # Seen from outside, corners go round counter-clockwise (y is the one axis whose plane is left-handed).
             square = square if (side == 1) != (axis == 1) else square[::-1]
             corners.append((local[voxel, None] + square[None]).reshape(-1, 3))
             voxels.append(voxel)
-    keys = np.ravel_multi_index(tuple(np.concatenate(corners).T), solid.shape)
+    keys = np.ravel_multi_index(tuple(np.concatenate(corners).T), shape)
     shared, quads = np.unique(keys, return_inverse=True)
     return Faces(
-        corner=(np.stack(np.unravel_index(shared, solid.shape), axis=-1) + low).astype(np.int32),
+        corner=(np.stack(np.unravel_index(shared, shape), axis=-1) + low).astype(np.int32),
         triangle=quads.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).astype(np.int32),
         voxel=np.concatenate(voxels).astype(np.int32),
     )
@@ -72,10 +75,11 @@ def merge_voxels(
 
 
 class VoxelView(NamedTuple):
-    """A plotly figure, and what its caption has to say of it."""
+    """A plotly figure, what its caption has to say of it, and how many voxels along an edge are drawn as one."""
 
     figure: Figure
     caption: str
+    merged: int
 
 
 def voxel_view(
@@ -83,6 +87,9 @@ def voxel_view(
     classes: Sequence[str],
     trajectory_world: Float[np.ndarray, "N 3"] | None = None,
     colours_of: Callable[[Float[np.ndarray, "M 3"]], UInt8[np.ndarray, "M 3"]] | None = None,
+    *,
+    merged: int = 1,
+    count: int | None = None,
 ) -> VoxelView:
     """Draws the visible faces of voxels by class, height or the images' colours (its buttons), with the rover's path.
 
@@ -93,11 +100,13 @@ def voxel_view(
         classes: their names.
         trajectory_world: the path.
         colours_of: gives the images' colours at centres of voxels (world); without it there is no such button.
+        merged: how many voxels of the map along an edge were merged into one of these.
+        count: of the map's voxels; by default of these.
     """
     from plotly.graph_objects import Figure
 
     size_m = np.asarray(voxels.voxel_size_m, np.float64)
-    index, label, merged = voxels.index, voxels.label, 1
+    index, label, count = voxels.index, voxels.label, len(voxels.label) if count is None else count
     # The corner of voxel (0, 0, 0), from the centre of the first voxel there is.
     origin_m = np.zeros(3)
     if len(index):
@@ -144,13 +153,13 @@ def voxel_view(
         updatemenus=buttons,
     )
     size = " × ".join(f"{edge_m:g}" for edge_m in size_m.astype(np.float32).tolist())
-    caption = f"{value_text(len(voxels.label))} occupied voxels of {size} m."
+    caption = f"{value_text(count)} occupied voxels of {size} m."
     if merged > 1:
         caption = (
-            f"{value_text(len(voxels.label))} occupied voxels, drawn as {value_text(len(label))} of {size} m: "
+            f"{value_text(count)} occupied voxels, drawn as {value_text(len(label))} of {size} m: "
             f"{merged} × {merged} × {merged} voxels merged into one, with the label of most of them."
         )
-    return VoxelView(figure, caption)
+    return VoxelView(figure, caption, merged)
 
 
 _BAR: dict[str, Any] = dict(thickness=10, len=0.55, x=1.0, xanchor="right", y=0.5, outlinewidth=0)
@@ -224,6 +233,7 @@ def _buttons(colourings: dict[str, dict[str, Any]]) -> dict[str, Any]:
 def _add_path(figure: Figure, path_world: Float[np.ndarray, "N 3"]) -> None:
     if not len(path_world):
         return
+    path_world = path_world[np.unique(np.linspace(0, len(path_world) - 1, _PATH_POINTS).round().astype(int))]
     xyz = {axis: path_world[:, i].astype(np.float32) for i, axis in enumerate("xyz")}
     figure.add_scatter3d(**xyz, mode="lines", line=dict(color="#2563eb", width=6), hoverinfo="skip", name="path")
     ends = {axis: values[[0, -1]] for axis, values in xyz.items()}

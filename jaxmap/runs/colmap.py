@@ -47,7 +47,7 @@ def export_colmap(folder: RunFolder, notify: Callable[[str], None], advance: Cal
         raise JaxmapError(frames.notes[0], where=folder.path, fix="map again")
     files = [f"{name}.jpg" for name in frames.names]
     centres = contents.voxels.centres_world
-    colours = image_colours(centres, [*seen_frames(contents).values()])
+    colours = image_colours(centres, [*seen_frames(contents.pictures, contents.group("camera")).values()])
     write_colmap(out, frames.camera, frames.size_px, files, frames.T_world_camera, centres, colours, site_origin)
     written = [f"{out.name}/{name}" for name in FILES]
     try:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 import jaxmap
-from jaxmap.datasets.crs import Extent, crs_text, read_crs
+from jaxmap.datasets.crs import Extent, crs_text, read_crs, transform_between
 from jaxmap.datasets.label_raster import DEFAULT_CODING, LabelCoding, LabelRaster, read_label_orthomosaic
 from jaxmap.datasets.poses import read_poses
 from jaxmap.datasets.rasters import read_picture
@@ -20,21 +20,26 @@ from jaxmap.datasets.rock_list import DEFAULT_DIAMETERS_M, draw_rocks, find_rock
 from jaxmap.ensemble.layer import stored_layers
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.camera_track import CameraTrack
-from jaxmap.evaluation.evaluate import ClassLayer, Evaluation, evaluate_map
+from jaxmap.evaluation.evaluate import ClassLayer, Evaluation, evaluate_map, place_of
 from jaxmap.evaluation.options import ScoringOptions
-from jaxmap.evaluation.truth_cells import pixel_corners, sample_between
+from jaxmap.evaluation.truth_cells import MAX_HEADING_RAD, pixel_corners, sample_between
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams, stored_fusion
-from jaxmap.fusion.query import top_down
+from jaxmap.fusion.query import TopDown, top_down
+from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.bounded_text import read_json
 from jaxmap.host.output_folder import write_json
-from jaxmap.mapping.store import load_map
+from jaxmap.mapping.arrays import TILE
+from jaxmap.mapping.attributes import MapAttributes
+from jaxmap.mapping.columns import MOST_WHOLE, part_of, top_down_of
+from jaxmap.mapping.store import Columns, MapReader, open_map
 from jaxmap.report.error_map import write_error_map
 from jaxmap.runs.folder import RunFolder
-from jaxmap.types import VoxelMap
+from jaxmap.types import GridSpec, VoxelMap
 
 _MARGIN_M, _MARGIN_SHARE = 3.0, 0.05
 _BACKDROP_SAMPLES = 8
+_AROUND_M, _RIM_SAMPLES = 10.0, 33
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,32 @@ class TruthOptions:
     diameters_m: Mapping[str, float] | None = None
 
 
-def read_class_layer(run: Path, target: str) -> ClassLayer:
-    """The class `target` of a run's map, as it is scored.
+class ScoredMap(NamedTuple):
+    """A map that is scored for one class, not yet read."""
+
+    reader: MapReader
+    params: FusionParams
+    rule: FusionRule
+    target: str
+    path: Path
+
+    def layer(self, within: Columns) -> ClassLayer:
+        """The class over a rectangle of columns.
+
+        Raises:
+            JaxmapError: a tile is damaged, or no memory holds the columns.
+        """
+        attributes = self.reader.attributes
+        top = top_down_of(self.reader, self.params, self.rule, within)
+        grid = part_of(self.reader.grid, within)
+        where = (np.asarray(attributes.site_origin, np.float64), attributes.crs)
+        layer = _class_layer(top, grid, self.reader.classes, self.params, self.target, *where)
+        ensemble = stored_layers(attributes.layers, self.target, self.path)
+        return layer if ensemble is None else replace(layer, ensemble=np.asarray(ensemble.probability)[within])
+
+
+def open_scored(run: Path, target: str) -> ScoredMap:
+    """Opens the map of a run to be scored for the class `target`.
 
     Raises:
         JaxmapError: there is no map, or it is damaged.
@@ -64,16 +93,12 @@ def read_class_layer(run: Path, target: str) -> ClassLayer:
     folder = RunFolder(run)
     if not run.is_dir():
         raise JaxmapError("no such run folder", where=run, fix="give a folder that `jaxmap map` wrote")
-    voxel_map, attributes = load_map(folder.map)
-    if target not in voxel_map.classes:
-        known = f"its classes are {' '.join(voxel_map.classes)}" if voxel_map.classes else "it has no class at all"
+    reader = open_map(folder.map)
+    if target not in reader.classes:
+        known = f"its classes are {' '.join(reader.classes)}" if reader.classes else "it has no class at all"
         raise UsageError(f"the map has no class {target!r}: {known}", where=folder.map, fix="name one with --class")
-    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
-    layer = class_layer_of(
-        voxel_map, params, rule, target, site_origin=np.asarray(attributes.site_origin, np.float64), crs=attributes.crs
-    )
-    ensemble = stored_layers(attributes.layers, target, folder.map)
-    return layer if ensemble is None else replace(layer, ensemble=np.asarray(ensemble.probability))
+    params, rule = stored_fusion(reader.attributes.fusion, reader.classes, folder.map)
+    return ScoredMap(reader, params, rule, target, folder.map)
 
 
 def class_layer_of(
@@ -95,14 +120,26 @@ def class_layer_of(
         site_origin: where the origin of the map's world lies in `crs`, metres.
         crs: coordinate reference system of the site, or None.
     """
-    top = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
-    index = voxel_map.classes.index(target)
+    top = top_down(voxel_map, params, rule)
+    return _class_layer(top, voxel_map.grid, voxel_map.classes, params, target, site_origin, crs)
+
+
+def _class_layer(
+    top: TopDown,
+    grid: GridSpec,
+    classes: tuple[str, ...],
+    params: FusionParams,
+    target: str,
+    site_origin: Float64[np.ndarray, "3"],
+    crs: str | None,
+) -> ClassLayer:
+    index, observed = classes.index(target), np.asarray(top.observed)
     return ClassLayer(
-        grid=voxel_map.grid,
-        is_class=(top.label == index) & top.observed,
-        probability=top.probability[index],
-        observed=top.observed,
-        height_m=top.height_m,
+        grid=grid,
+        is_class=(np.asarray(top.label) == index) & observed,
+        probability=np.asarray(top.probability[index]),
+        observed=observed,
+        height_m=np.asarray(top.height_m),
         prior=float(jax.nn.sigmoid(params.class_prior[index])),
         site_origin=site_origin,
         crs=crs,
@@ -173,13 +210,19 @@ def evaluate_run(
     Raises:
         JaxmapError: map or truth cannot be read, or do not lie over each other.
     """
-    layer = read_class_layer(run, truth_options.target)
-    cameras, remark = read_cameras(run, layer.site_origin)
+    scored = open_scored(run, truth_options.target)
+    grid, attributes = scored.reader.grid, scored.reader.attributes
+    site_origin = np.asarray(attributes.site_origin, np.float64)
+    cameras, remark = read_cameras(run, site_origin)
     if cameras is None and options.max_range_m is not None:
         raise JaxmapError(
             f"--max-range-m needs poses.tum and metrics.json of the run: {remark}", where=run, fix="map again"
         )
-    raster = read_truth(sources, layer.place, truth_options)
+    raster = read_truth(sources, place_of(grid, site_origin, attributes.crs), truth_options)
+    within = slice(0, grid.shape[0]), slice(0, grid.shape[1])
+    if grid.shape[0] * grid.shape[1] > MOST_WHOLE:
+        within = _columns_under(raster, grid, within, attributes)
+    layer = scored.layer(within)
     evaluation = evaluate_map(layer, raster, cameras, options)
     evaluation.scores.update(
         {
@@ -192,6 +235,35 @@ def evaluate_run(
         }
     )
     return evaluation, layer
+
+
+def _columns_under(raster: LabelRaster, grid: GridSpec, within: Columns, attributes: MapAttributes) -> Columns:
+    """The columns that a truth can be compared with, some metres around it included: the rest of a large map is left.
+
+    Raises:
+        JaxmapError: no transformation is known between its system and the map's.
+    """
+    height, width = raster.labels.shape
+    rim = np.linspace(0, 1, _RIM_SAMPLES)
+    zero, one = np.zeros_like(rim), np.ones_like(rim)
+    column, row = np.concatenate([[rim, zero], [rim, one], [zero, rim], [one, rim]], axis=1)
+    T, transform = raster.T_crs_pixel, transform_between(raster.crs, attributes.crs, raster.name)
+    xy = np.stack(transform(*(T[i, 0] * column * width + T[i, 1] * row * height + T[i, 2] for i in (0, 1))), axis=-1)
+    xy = xy[np.isfinite(xy).all(axis=-1)] - np.asarray(attributes.site_origin)[:2]
+    if not len(xy):
+        return within
+    # Far enough for the ground beside it, and for a truth that is turned and shifted to where it fits.
+    margin_m = _AROUND_M + 2 * MAX_HEADING_RAD * float(np.linalg.norm(np.ptp(xy, axis=0)))
+    corner_m, voxel_m = (numbers[:2] for numbers in exact_corner(grid))
+    first = np.floor((xy.min(axis=0) - margin_m - corner_m) / voxel_m).astype(int)
+    last = np.ceil((xy.max(axis=0) + margin_m - corner_m) / voxel_m).astype(int)
+    # Whole tiles: what is left out does not move the cells.
+    first, last = first // TILE[:2] * TILE[:2], -(-last // TILE[:2]) * TILE[:2]
+    x, y = (
+        slice(max(int(a), part.start), max(min(int(b), part.stop), max(int(a), part.start) + 1))
+        for a, b, part in zip(first, last, within, strict=True)
+    )
+    return x, y
 
 
 def read_backdrop(path: Path, evaluation: Evaluation, layer: ClassLayer) -> UInt8[np.ndarray, "BI BJ 3"]:

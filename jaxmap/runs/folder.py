@@ -4,33 +4,29 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmap.datasets.poses import read_poses, write_tum
+from jaxmap.datasets.poses import write_tum
 from jaxmap.ensemble.layer import stored_layers
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.export.geotiff import write_geotiff
-from jaxmap.export.ply import write_ply
-from jaxmap.export.voxels import occupied_voxels
+from jaxmap.export.formats import FORMATS
 from jaxmap.fusion.neighbours import kernel_margin
 from jaxmap.fusion.options import FusionRule
-from jaxmap.fusion.params import FusionParams, stored_fusion
-from jaxmap.fusion.query import TopDown, observed, occupied, top_down, voxel_labels
+from jaxmap.fusion.params import FusionParams
+from jaxmap.fusion.query import observed, occupied, voxel_labels
 from jaxmap.host.bounded_text import read_text
 from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, locked, write_yaml
 from jaxmap.host.replacement import Replacement
-from jaxmap.mapping.store import MapReader, holds_map, load_map, stray_maps
-from jaxmap.planning.ground import absolute_layers
+from jaxmap.mapping.store import MapReader, holds_map, stray_maps
+from jaxmap.report.detail import FOLDER
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
-from jaxmap.report.top_down import missed_picture, top_down_picture
 from jaxmap.runs.config import OBSERVATIONS
 from jaxmap.stereo.front_end import RectifiedFrame
 
@@ -47,10 +43,6 @@ class RunFolder:
         self.path = path
         self.map = path / "map.zarr"
         self.observations = path / OBSERVATIONS
-        self.ply = path / "map.ply"
-        self.geotiff = path / "bev.tif"
-        self.picture = path / "bev.png"
-        self.missed = path / "missed.png"
         self.metrics = path / "metrics.json"
         self.config = path / "config.yaml"
         self.poses = path / "poses.tum"
@@ -67,7 +59,7 @@ class RunFolder:
         return locked(self.path)
 
     @contextmanager
-    def writing(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> Iterator[RunFolder]:
+    def writing(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> Iterator[RunFolder]:
         """Begins a run and yields the folder it is to write into, see `begin`.
 
         A run that is replaced stays until the block has ended without an error.
@@ -79,8 +71,13 @@ class RunFolder:
         with self._replacement.written(keep=lambda: holds_map(work.map)):
             yield work
 
-    def begin(self, settings: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
+    def begin(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> RunFolder:
         """Writes the resolved settings (`Plan.settings`), or checks that the run here can be resumed with them.
+
+        Args:
+            settings: as plain values.
+            resume: go on with what is there; None for work that cannot be resumed.
+            overwrite: replace what is there.
 
         Returns:
             Where to write: here, or where a run is replaced, a folder within.
@@ -98,10 +95,11 @@ class RunFolder:
             check_same_settings(work.config, dict(settings))
             return work
         if not overwrite and (used or holds_map(replacing.map)):
+            going_on = "" if resume is None else "resume it (--resume), "
             raise JaxmapError(
                 "the folder holds a run already",
                 where=self.path,
-                fix="resume it (--resume), replace it (--overwrite), or choose another folder",
+                fix=f"{going_on}replace it (--overwrite), or choose another folder",
             )
         self._check_own()
         self._replacement.discard()
@@ -121,11 +119,11 @@ class RunFolder:
 
     @property
     def _files(self) -> tuple[Path, ...]:
-        report = self.path / "report.html"
+        pages = (self.path / "report.html", self.path / "explain.html")
         # Scores are of the map that is there: they go with it.
         scored = (self.scores, self.errors, self.pose_scores)
-        derived = (self.ply, self.geotiff, self.picture, self.missed)
-        return (*derived, self.metrics, self.poses, self.frames, report, self.config, *scored)
+        derived = [self.path / file for form in FORMATS.values() for file in form.files]
+        return (*derived, self.metrics, self.poses, self.frames, *pages, self.config, *scored)
 
     def check_apart(self, source: str, images: Iterable[Path], inputs: Iterable[Path | None]) -> None:
         """Refuses to write where the inputs lie; to be called before anything is made.
@@ -170,7 +168,7 @@ class RunFolder:
 
     def _outputs(self) -> Iterator[Path]:
         """What an earlier run has written, and nothing else."""
-        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, *self._files)
+        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, self.path / FOLDER, *self._files)
         for picture in self.pictures.glob("*"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 yield picture
@@ -220,46 +218,6 @@ def write_key_frame(
         with atomic_path(folder.pictures / f"{index:06d}_{kind}.{ending}") as temporary:
             # Noise does not compress: more effort takes four times as long and saves little.
             image.save(temporary, **effort)
-
-
-EXPORTS: dict[str, str] = {"ply": "map.ply", "geotiff": "bev.tif", "png": "bev.png"}
-"""The file that each form of a map goes into."""
-
-
-def write_exports(folder: RunFolder, reader: MapReader, formats: Sequence[str] = tuple(EXPORTS)) -> list[str]:
-    """Writes the map in other forms, and returns the names of the files.
-
-    The pictures show the path of poses.tum, where there is one. Of a map with an ensemble there is another picture,
-    of what it may have missed.
-    """
-    written = [EXPORTS[name] for name in EXPORTS if name in formats]
-    voxel_map, attributes = load_map(folder.map)
-    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
-    if "ply" in formats:
-        write_ply(folder.ply, occupied_voxels(voxel_map, params, rule), voxel_map.classes, attributes.site_origin)
-    top: TopDown = jax.tree.map(np.asarray, top_down(voxel_map, params, rule))
-    if "geotiff" in formats:
-        where = (attributes.crs, attributes.site_origin)
-        write_geotiff(
-            folder.geotiff,
-            top,
-            voxel_map.grid,
-            voxel_map.classes,
-            *where,
-            layers=absolute_layers(attributes.layers, where[1][2]),
-        )
-    if "png" in formats:
-        path_world = None
-        if folder.poses.exists():
-            path_world = read_poses(folder.poses).T[:, :3, 3] - attributes.site_origin
-        grid, placed = voxel_map.grid, attributes.crs is not None
-        top_down_picture(top, grid, voxel_map.classes, path_world, folder.picture, georeferenced=placed)
-        target = rule.target(voxel_map.classes)
-        ensemble = stored_layers(attributes.layers, target, folder.map)
-        if ensemble is not None and target is not None:
-            missed_picture(ensemble, target, top, grid, path_world, folder.missed, georeferenced=placed)
-            written.append(folder.missed.name)
-    return written
 
 
 def count_voxels(reader: MapReader, params: FusionParams, rule: FusionRule) -> dict[str, Any]:

@@ -25,7 +25,8 @@ from jaxmap.planning.ground import map_layers
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.checking import finding_line, findings_tree
-from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_exports, write_key_frame, write_poses
+from jaxmap.runs.exports import write_exports
+from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_key_frame, write_poses
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Plan

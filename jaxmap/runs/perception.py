@@ -188,19 +188,19 @@ def _of_observations(folder: Path, config: PerceiveConfig, notify: Notify, *, im
     network, model = None, None
     if of_kept and attributes.network is not None:
         network = _architecture_of(attributes.network, folder)
-        model = ModelFile(Path(attributes.model["file"]), attributes.model["sha256"]) if attributes.model else None
+        told = attributes.model or {}
+        model = ModelFile(Path(told.get("file", "")), told.get("sha256", "")) if told else None
     with as_usage_error():
         labeller = make_no_labeller() if images else choose_labeller(config, soft, network, observations.camera)
     if model is not None and network is not None:
         notify(describe_network(model, network, labeller.classes))
-    findings = tuple(Finding(**finding) for finding in attributes.findings)
     return Perception(
         source=str(real_path(folder)),
         sequence=sequence,
         front_end=front_end,
         labeller=labeller,
         model=model,
-        findings=findings,
+        findings=_findings_of(attributes, folder),
         observations=observations,
     )
 
@@ -328,6 +328,15 @@ def saw_relief(attributes: ObservationAttributes) -> bool:
     """Whether the network was shown the relief of each frame."""
     network, deeplab = attributes.network or {}, attributes.settings.get("deeplab", {})
     return bool(network.get("relief_channels")) and bool(deeplab.get("see_relief"))
+
+
+def _findings_of(attributes: ObservationAttributes, where: Path) -> tuple[Finding, ...]:
+    try:
+        return tuple(Finding(**finding) for finding in attributes.findings)
+    except TypeError as fault:
+        raise JaxmapError(
+            "the attribute findings is damaged", where=where, fix="perceive the sequence again"
+        ) from fault
 
 
 def _architecture_of(network: dict[str, Any], where: Path) -> Architecture:

@@ -15,6 +15,7 @@ import jaxmap
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.export.geotiff import write_bands
 from jaxmap.export.route import write_csv, write_geojson
+from jaxmap.export.source import absolute
 from jaxmap.fusion.params import stored_fusion
 from jaxmap.fusion.query import top_down
 from jaxmap.geometry.grid import exact_corner
@@ -22,7 +23,7 @@ from jaxmap.host.output_folder import write_json
 from jaxmap.host.settings import Settings
 from jaxmap.mapping.store import MapAttributes, load_map
 from jaxmap.planning.cost import CostMap, cost_map
-from jaxmap.planning.ground import Ground, absolute_layers, cell_size, ground_layers, hazards_of, read_ground
+from jaxmap.planning.ground import Ground, cell_size, ground_layers, hazards_of, read_ground
 from jaxmap.planning.hazards import Hazards
 from jaxmap.planning.options import RoverOptions
 from jaxmap.planning.path import NoPathError, Terrain, find_path, length_m, sampled, segment_costs, straightened
@@ -147,7 +148,7 @@ def write_plan(costs: Costs, plan: Plan, folder: Path) -> None:
     write_geojson(geojson, plan.points_m + attributes.site_origin[:2], attributes.crs, plan.metrics)
     write_csv(table, plan.along)
     layers = {name: np.asarray(value, np.float32) for name, value in costs.costs._asdict().items()}
-    layers |= absolute_layers(ground_layers(costs.ground.surface, costs.hazards), attributes.site_origin[2])
+    layers |= absolute(ground_layers(costs.ground.surface, costs.hazards), attributes.site_origin[2])
     write_bands(raster, layers, grid, attributes.crs, attributes.site_origin)
     write_json(metrics, plan.metrics)
 

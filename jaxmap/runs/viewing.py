@@ -42,7 +42,7 @@ def view_run(run: Path, save: Path | None) -> list[str]:
     folder = RunFolder(run)
     contents = read_run(run)
     frames = read_run_frames(folder, contents.attributes.site_origin)
-    with recording(contents.name, contents.voxel_map.classes, save) as log:
+    with recording(contents.name, contents.classes, save) as log:
         log.path(frames.T_world_camera[:, :3, 3])
         for frame, T, timestamp_s in zip(frames.index, frames.T_world_camera, frames.timestamps_s, strict=True):
             log.at(int(frame), float(timestamp_s))

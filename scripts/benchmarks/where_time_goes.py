@@ -21,10 +21,9 @@ import jax
 
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.memory import restart_with_lasting_memory
-from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import compile_step
 from jaxmap.profiling.step_profile import TRACED_FRAMES, WARM_UP_FRAMES, StepProfile, table_lines
-from jaxmap.runs.config import MapConfig, load_config
+from jaxmap.runs.config import MapConfig, config_of_observations, load_config, observations_in
 from jaxmap.runs.mapping_plan import plan_run
 
 
@@ -40,11 +39,13 @@ def main() -> None:
     # As the command does: with memory that comes fresh from the system at each frame, a step takes longer.
     restart_with_lasting_memory()
     keep_compiled_programs(scopes=True)
-    config = replace(
-        load_config(given.config) if given.config else MapConfig(), labeller=given.labeller, stop=given.frames
-    )
-    plan = plan_run(given.sequence, config, str)
-    prepared = list(prepare_frames(plan.sequence, plan.front_end, needs=plan.labeller.needs))
+    if (perceived := observations_in(given.sequence)) is not None:
+        config = config_of_observations(perceived, given.config)
+    else:
+        config = load_config(given.config) if given.config else MapConfig()
+    config = replace(config, labeller=given.labeller, stop=given.frames)
+    plan = plan_run(given.sequence, config, lambda line: None)
+    prepared = list(plan.prepare())
     frames = [one.frame for one in prepared if one.frame is not None]
     voxel_map = plan.mapper.init()
     mapper, cost = compile_step(plan.mapper, voxel_map, frames[0], plan.params, plan.key)

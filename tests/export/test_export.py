@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from export_maps import UTM_SITE, empty_map, random_map, source_of, stored_source
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxmap.errors import JaxmapError
-from jaxmap.export.geotiff import write_geotiff
+from jaxmap.export.geotiff import write_cog, write_geotiff
 from jaxmap.export.ply import write_ply
 from jaxmap.export.voxels import occupied_voxels
 from jaxmap.fusion.options import FusionRule
@@ -20,18 +24,7 @@ from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import TopDown, class_probabilities, occupancy_probability, occupied, top_down, voxel_labels
 from jaxmap.geometry.grid import voxel_centres, world_to_voxel
 from jaxmap.labels import IGNORE, ROVER_CLASSES, class_colours
-from jaxmap.types import GridSpec, VoxelMap
-
-UTM_SITE = np.array([588123.456789, 5790321.654321, 12.5])
-
-
-def random_map(seed: int, classes: tuple[str, ...] = ROVER_CLASSES) -> VoxelMap:
-    rng = np.random.default_rng(seed)
-    shape = (6, 5, 4)
-    touched = rng.random(shape) < 0.4
-    log_odds = rng.normal(size=(1 + len(classes), *shape)) * touched
-    grid = GridSpec(jnp.array([-1.5, 2.25, -0.5], jnp.float32), jnp.array([0.2, 0.3, 0.1], jnp.float32), shape)
-    return VoxelMap(jnp.asarray(log_odds, jnp.float32), jnp.asarray(3, jnp.int32), grid, classes)
+from jaxmap.report.overview import overview
 
 
 def read_ply(path: Path) -> tuple[list[str], np.ndarray]:
@@ -77,7 +70,7 @@ def test_ply_holds_the_voxels(tmp_path_factory, seed, georeferenced) -> None:
     path = tmp_path_factory.mktemp("ply") / "map.ply"
     voxel_map, site = random_map(seed), UTM_SITE if georeferenced else np.zeros(3)
     voxels = occupied_voxels(voxel_map, make_fusion_params(ROVER_CLASSES), FusionRule())
-    write_ply(path, voxels, ROVER_CLASSES, site)
+    write_ply(source_of(voxel_map, utm=georeferenced), path)
     comments, vertices = read_ply(path)
     assert vertices["x"].dtype == ("<f8" if georeferenced else "<f4")
     xyz = np.stack([vertices[axis] for axis in "xyz"], axis=-1)
@@ -91,10 +84,7 @@ def test_ply_holds_the_voxels(tmp_path_factory, seed, georeferenced) -> None:
 
 
 def test_ply_of_nothing_and_of_odd_names(tmp_path) -> None:
-    empty = VoxelMap(jnp.zeros((2, 2, 2, 2)), jnp.asarray(0), GridSpec(jnp.zeros(3), jnp.ones(3), (2, 2, 2)), ("é\nx",))
-    write_ply(
-        tmp_path / "a.ply", occupied_voxels(empty, make_fusion_params(("a",)), FusionRule()), empty.classes, np.zeros(3)
-    )
+    write_ply(source_of(empty_map(("é\nx",))), tmp_path / "a.ply")
     comments, vertices = read_ply(tmp_path / "a.ply")
     assert len(vertices) == 0 and "class 0 \\xe9 x" in comments
 
@@ -110,7 +100,7 @@ def test_geotiff_holds_each_column_at_its_place(tmp_path_factory, seed, classes,
     site, crs = (UTM_SITE, "EPSG:32631") if georeferenced else (np.zeros(3), None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        write_geotiff(path, top, voxel_map.grid, classes, crs, site)
+        write_geotiff(source_of(voxel_map, utm=georeferenced), path)
     with rasterio.open(path) as raster:
         assert (raster.crs.to_string() if raster.crs else None) == crs
         assert raster.descriptions == ("label", "height_m", *(f"probability_{name}" for name in classes))
@@ -131,11 +121,11 @@ def test_geotiff_holds_each_column_at_its_place(tmp_path_factory, seed, classes,
                 assert np.array_equal(probabilities, top.probability[:, x, y])
 
 
-def test_an_unknown_crs_is_an_error(tmp_path) -> None:
-    voxel_map = random_map(0)
-    top = as_numpy(top_down(voxel_map, make_fusion_params(ROVER_CLASSES), FusionRule()))
+@pytest.mark.parametrize("write", [write_geotiff, write_cog])
+def test_an_unknown_crs_is_an_error(tmp_path, write) -> None:
+    source = source_of(random_map(0), crs="EPSG:1")
     with pytest.raises(JaxmapError, match="unknown coordinate reference system 'EPSG:1'") as caught:
-        write_geotiff(tmp_path / "bev.tif", top, voxel_map.grid, ROVER_CLASSES, "EPSG:1", np.zeros(3))
+        write(source, tmp_path / "bev.tif")
     assert "\n" not in str(caught.value) and list(tmp_path.iterdir()) == []
 
 
@@ -143,14 +133,90 @@ def test_a_full_disk_keeps_the_old_file(tmp_path, monkeypatch) -> None:
     def full(*_args):
         raise OSError(28, "No space left on device")
 
-    voxel_map, params = random_map(1), make_fusion_params(ROVER_CLASSES)
-    voxels, top = occupied_voxels(voxel_map, params, FusionRule()), as_numpy(top_down(voxel_map, params, FusionRule()))
     for name in ("map.ply", "bev.tif"):
         (tmp_path / name).write_text("old")
     monkeypatch.setattr("jaxmap.host.files.sync", full)
+    source = source_of(random_map(1))
     with pytest.raises(JaxmapError, match="disk full"):
-        write_ply(tmp_path / "map.ply", voxels, ROVER_CLASSES, np.zeros(3))
+        write_ply(source, tmp_path / "map.ply")
     with pytest.raises(JaxmapError, match="disk full"):
-        write_geotiff(tmp_path / "bev.tif", top, voxel_map.grid, ROVER_CLASSES, None, np.zeros(3))
+        write_geotiff(source, tmp_path / "bev.tif")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bev.tif", "map.ply"]
     assert {p.read_text() for p in tmp_path.iterdir()} == {"old"}
+
+
+def test_a_disk_that_fills_up_while_a_raster_is_written_is_an_error(tmp_path) -> None:
+    program = (
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from export_maps import random_map, source_of; from jaxmap.export.geotiff import write_geotiff\n"
+        "source = source_of(random_map(0, shape=(256, 256, 1)))\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
+        "write_geotiff(source, Path(sys.argv[1]))"
+    )
+    words = [sys.executable, "-c", program, str(tmp_path / "bev.tif")]
+    ended = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert "JaxmapError: writing failed" in ended.stderr and list(tmp_path.iterdir()) == []
+
+
+def test_a_cog_is_valid_and_holds_the_same(tmp_path) -> None:
+    import rasterio
+    from rio_cogeo.cogeo import cog_validate
+
+    source = source_of(random_map(2, shape=(300, 290, 1)), utm=True)
+    write_geotiff(source, tmp_path / "bev.tif")
+    write_cog(source, tmp_path / "cog.tif")
+    valid, faults, warned = cog_validate(tmp_path / "cog.tif", strict=True)
+    assert valid and not faults and not warned
+    with rasterio.open(tmp_path / "bev.tif") as plain, rasterio.open(tmp_path / "cog.tif") as cog:
+        assert (plain.descriptions, plain.crs, plain.transform) == (cog.descriptions, cog.crs, cog.transform)
+        assert np.array_equal(plain.read(), cog.read(), equal_nan=True) and plain.tags() == cog.tags()
+        overview_label = cog.read(1, out_shape=(145, 150))
+        assert set(np.unique(overview_label[~np.isnan(overview_label)])) <= {0.0, 1.0, 2.0}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bev.tif", "cog.tif"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reach", [0, 1])
+def test_a_map_in_tiles_is_written_as_one_in_memory(tmp_path, reach) -> None:
+    """Ten of fifteen tiles are there; a kernel looks across their edges."""
+    import rasterio
+
+    whole = random_map(3, shape=(150, 130, 3))
+    log_odds = np.array(whole.log_odds)
+    log_odds[:, 64:128, :64] = 0
+    whole = replace(whole, log_odds=jnp.asarray(log_odds))
+    kernel = np.random.default_rng(0).normal(0, 0.3, (3, 3, 3)) + np.eye(3)[[1]] * np.eye(3)[1][:, None]
+    fusion = {"params": {"class_kernel": kernel.tolist()}} if reach else {}
+    sources = [stored_source(whole, tmp_path / "map.zarr", fusion=fusion), source_of(whole, fusion=fusion)]
+    rasters, points, views = [], [], []
+    for number, source in enumerate(sources):
+        write_geotiff(source, tmp_path / f"{number}.tif")
+        write_ply(source, tmp_path / f"{number}.ply")
+        with rasterio.open(tmp_path / f"{number}.tif") as raster:
+            rasters.append(raster.read())
+        points.append(np.sort(read_ply(tmp_path / f"{number}.ply")[1]))
+        views.append(overview(source, 40)[0])
+    assert np.array_equal(rasters[0][:2], rasters[1][:2], equal_nan=True)
+    # A kernel's sums are rounded otherwise by programs for other shapes.
+    np.testing.assert_allclose(rasters[0][2:], rasters[1][2:], atol=1e-6 if reach else 0)
+    for name in points[0].dtype.names or ():
+        np.testing.assert_allclose(points[0][name], points[1][name], atol=1e-6 if name == "probability" else 0)
+    for one, other in zip(*views, strict=True):
+        assert np.array_equal(one, other, equal_nan=one.dtype == np.float32)
+
+
+def test_an_overview_keeps_rocks_and_the_highest() -> None:
+    source = source_of(random_map(4, shape=(12, 9, 3)))
+    whole, _, same = overview(source, 12)
+    coarse, _, grid = overview(source, 4)
+    assert same is source.reader.grid and grid.shape == (4, 3, 3)
+    assert np.allclose(grid.voxel_size_m, [0.6, 0.9, 0.1])
+    for x in range(4):
+        for y in range(3):
+            part = tuple(slice(3 * i, 3 * i + 3) for i in (x, y))
+            assert coarse.observed[x, y] == whole.observed[part].any()
+            label, height_m = whole.label[part], whole.height_m[part]
+            if (label == 2).any():
+                assert coarse.label[x, y] == 2 and coarse.height_m[x, y] == height_m[label == 2].max()
+            elif coarse.observed[x, y]:
+                assert coarse.height_m[x, y] == np.nanmax(height_m)

@@ -90,7 +90,7 @@ def test_view_is_in_metres_with_a_toggle_and_the_path() -> None:
     index = np.argwhere(np.ones((4, 3, 1), bool))
     label = np.where(index[:, 0] < 2, 1, 2)
     path_world = np.array([[0.0, 0, 1], [0.8, 0.9, 1], [np.nan] * 3])
-    figure, caption = voxel_view(voxels_of(index, label), ROVER_CLASSES, path_world)
+    figure, caption, _ = voxel_view(voxels_of(index, label), ROVER_CLASSES, path_world)
     mesh, line, ends = figure.data
     assert (mesh.x.min(), mesh.x.max()) == (0, np.float32(0.8))
     assert (mesh.z.min(), mesh.z.max()) == (0, np.float32(0.1))
@@ -116,7 +116,7 @@ def test_view_in_the_colours_of_the_images() -> None:
     def colours_of(points_world):
         return np.where(points_world[:, :1] < 0.8, *np.array(shades, np.uint8)).astype(np.uint8)
 
-    figure, _ = voxel_view(voxels_of(index), ROVER_CLASSES, colours_of=colours_of)
+    figure, *_ = voxel_view(voxels_of(index), ROVER_CLASSES, colours_of=colours_of)
     buttons = figure.layout.updatemenus[0].buttons
     assert [button.label for button in buttons] == ["Classes", "Height", "Images"]
     (colouring, _) = buttons[2].args
@@ -129,16 +129,16 @@ def test_view_in_the_colours_of_the_images() -> None:
 
 def test_view_is_coarsened_and_says_so(monkeypatch) -> None:
     monkeypatch.setattr(voxel_view_module, "MAX_FACES", 100)
-    figure, caption = voxel_view(voxels_of(np.argwhere(np.ones((20, 20, 2), bool))), ROVER_CLASSES)
+    figure, caption, _ = voxel_view(voxels_of(np.argwhere(np.ones((20, 20, 2), bool))), ROVER_CLASSES)
     assert caption.startswith("800 occupied voxels, drawn as 25 of 0.8 × 1.2 × 0.4 m: 4 × 4 × 4 voxels merged into one")
     assert len(figure.data[0].i) <= 200
     assert (figure.data[0].x.min(), figure.data[0].x.max()) == (0, 4)
 
 
 def test_view_without_classes_and_without_voxels() -> None:
-    figure, _ = voxel_view(voxels_of([[0, 0, 0]], np.array([IGNORE])), ())
+    figure, *_ = voxel_view(voxels_of([[0, 0, 0]], np.array([IGNORE])), ())
     assert not figure.layout.updatemenus
-    figure, caption = voxel_view(voxels_of(np.zeros((0, 3))), ROVER_CLASSES)
+    figure, caption, _ = voxel_view(voxels_of(np.zeros((0, 3))), ROVER_CLASSES)
     assert not figure.data
     assert caption.startswith("0 occupied voxels")
 

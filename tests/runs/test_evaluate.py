@@ -199,4 +199,4 @@ def test_damaged_inputs_are_one_line(cli, run, tmp_path):
     outcome = cli("evaluate", run, truth)
     assert outcome.status == 1 and "damaged" in outcome.error
     truth.write_bytes(truth.read_bytes()[:300])
-    assert "map" in cli("evaluate", run, truth).error
+    assert "not a readable raster" in cli("evaluate", run, truth).error

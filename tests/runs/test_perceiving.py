@@ -21,6 +21,7 @@ from scenes import frame_name, pose, timestamp_s
 
 import jaxmap.mapping.observations as store
 from jaxmap.datasets.poses import write_tum
+from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.mapping.observations import open_observations
 from jaxmap.runs.config import config_of_observations
@@ -232,6 +233,16 @@ def test_a_damaged_frame_is_left_out_with_its_reason(copy):
     prepared = list(plan_of(copy).prepare())
     assert [one.frame is None for one in prepared] == [index == 1 for index in range(FRAMES)]
     assert "remove that folder and run jaxmap perceive again" in str(prepared[1].fault)
+
+
+@pytest.mark.slow
+def test_the_members_of_an_ensemble_stand_where_they_stand_over_images(perceived, scene_folder):
+    direct, again = (
+        planned(scene_folder, ensemble={"members": 2}),
+        plan_of(perceived, ensemble=EnsembleOptions(members=2)),
+    )
+    for one, other in zip(frames_of(again), frames_of(direct), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.mark.slow

@@ -1,0 +1,80 @@
+"""Maps of nav2's map server: what is an obstacle, and what driving costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxmap.errors import JaxmapError
+from jaxmap.export.source import Columns, Source
+from jaxmap.host.files import atomic_path
+
+COST_LAYER = "cost"
+"""The layer of a map that holds what a metre of driving costs, in metres of level driving: 1 or more."""
+FREE, UNKNOWN, OCCUPIED = 254, 205, 0
+_MOST_CELLS = 1 << 28
+
+
+def write_nav2(source: Source, map_yaml: Path, map_image: Path, costs_yaml: Path, costs_image: Path) -> None:
+    """Writes two maps, north up, each an image and its YAML.
+
+    `map` is trinary: occupied where the label is the class asked about first (rock), free elsewhere, unknown where
+    nothing was seen. `costs` is of mode `scale`: from the layer `COST_LAYER`, or else the probability of that class; as
+    PNG, since this mode takes its unknown cells from transparency, which PGM has not.
+
+    Raises:
+        JaxmapError: the map has no class of obstacles, its columns are no squares, nothing was observed, the map is too
+            large for one image, or the disk refuses.
+    """
+    from PIL import Image
+
+    if source.target is None:
+        raise JaxmapError(
+            f"the map has no class of obstacles: its classes are {', '.join(source.classes) or 'none'}",
+            where=source.where,
+            fix="map with a labeller that knows rocks",
+        )
+    edge_m = source.square_cells("nav2")
+    columns = source.observed_whole(_MOST_CELLS, "nav2")
+    corner_m = source.corner_m[:2] + np.asarray(columns.corner) * source.size_m[:2]
+    for image, settings, (pixels, mode) in (
+        (map_image, map_yaml, (trinary(columns, source.target), "trinary")),
+        (costs_image, costs_yaml, (scaled(costs(columns, source.target)), "scale")),
+    ):
+        free, occupied = (0.196, 0.65) if mode == "trinary" else (0.5 / 255, 1 - 0.5 / 255)
+        with atomic_path(image) as temporary:
+            Image.fromarray(np.ascontiguousarray(np.swapaxes(pixels, 0, 1)[::-1])).save(temporary)
+        lines = [
+            f"image: {image.name}",
+            f"mode: {mode}",
+            f"resolution: {edge_m!r}",
+            f"origin: [{corner_m[0]:.9g}, {corner_m[1]:.9g}, 0.0]",
+            "negate: 0",
+            f"occupied_thresh: {occupied:.6f}",
+            f"free_thresh: {free:.6f}",
+        ]
+        with atomic_path(settings) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def trinary(columns: Columns, target: int) -> UInt8[np.ndarray, "X Y"]:
+    """Grey values of obstacles (the label `target`), free and unknown cells."""
+    top = columns.top
+    return np.where(top.observed, np.where(top.label == target, OCCUPIED, FREE), UNKNOWN).astype(np.uint8)
+
+
+def costs(columns: Columns, target: int) -> Float[np.ndarray, "X Y"]:
+    """Costs from 0 to 1, NaN where they are not known: `1 - 1 / cost` of the layer, or else the probability of rock."""
+    layer = columns.layers.get(COST_LAYER)
+    if layer is None:
+        return np.where(columns.top.observed, columns.top.probability[target], np.nan)
+    return 1 - 1 / np.maximum(layer, 1)
+
+
+def scaled(cost: Float[np.ndarray, "X Y"]) -> UInt8[np.ndarray, "X Y 2"]:
+    """Grey value and opacity of costs: white costs nothing, black everything, what is not known is transparent."""
+    known = ~np.isnan(cost)
+    grey = np.where(known, 255 - np.rint(np.nan_to_num(cost) * 255), UNKNOWN)
+    return np.stack([grey, np.where(known, 255, 0)], axis=-1).astype(np.uint8)
