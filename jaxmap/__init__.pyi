@@ -28,8 +28,8 @@ from .mapping.step import Mapper, MapperParams, make_mapper
 from .mapping.store import MapAttributes, load_map, save_map
 from .models.architecture import Architecture, tf_architecture, torch_architecture, torchvision_architecture
 from .models.checkpoint import SavedModel, load_model, load_network, save_model
-from .models.deeplab import PureNetwork, fold_batch_norm, make_network, pure_form, pure_network
 from .models.importers import import_weights
+from .models.network import PureNetwork, fold_batch_norm, make_network, pure_form, pure_network
 from .runs.segmentation import Segmenter
 from .stereo.front_end import StereoFrontEnd
 from .stereo.match import StereoOptions

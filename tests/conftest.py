@@ -26,11 +26,23 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-# `types`, `fusion.params` and `models.deeplab` stay out: JAX rebuilds their dataclasses with stacked arrays,
+# `types`, `fusion.params` and `models.network` stay out: JAX rebuilds their dataclasses with stacked arrays,
 # placeholders for leaves, and shapes without arrays.
 FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model", "fusion.splat")
 NETWORK_MODULES = tuple(
-    f"models.{name}" for name in ("backbones", "convolutions", "heads", "layers", "pixelwise", "resizing")
+    f"models.{name}"
+    for name in (
+        "backbones",
+        "convolutions",
+        "fcn",
+        "heads",
+        "layers",
+        "pixelwise",
+        "resizing",
+        "segnet",
+        "unet",
+        "unpooling",
+    )
 )
 CHECKED_MODULES = (
     *FUSION_MODULES,

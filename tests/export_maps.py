@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmap.export.source import KeyFrame, Pinholes, Source, Track
+from jaxmap.export.source import Camera, KeyFrame, Source, Track
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.store import in_memory, open_map, save_map
@@ -68,8 +68,8 @@ def short_track() -> Track:
     T = np.tile(np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1.5], [0, 0, 0, 1]]), (3, 1, 1))
     T[:, 0, 3] = [0.0, 0.5, 1.0]
     times_s = 1.7e9 + np.arange(3.0)
-    key_frame = KeyFrame(float(times_s[1]), T[1], png())
-    return Track(times_s, T, Pinholes(20.0, 20.0, 7.5, 5.5, 16, 12), (key_frame,))
+    key_frame = KeyFrame(float(times_s[1]), T[1], Camera(20.0, 20.0, 7.5, 5.5, 16, 12), png(), "png")
+    return Track(times_s, T, (key_frame,))
 
 
 def png() -> bytes:

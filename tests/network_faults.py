@@ -17,7 +17,7 @@ from golden.seeded_weights import exported, seeded_image, seeded_weights
 from PIL import Image
 from safetensors.numpy import save
 
-from jaxmap.models import importers as tables
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import save_model
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxmap.models.deeplab import padded_size
+from jaxmap.models.base import padded_size
 
 IGNORE = 255
 

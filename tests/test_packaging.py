@@ -23,6 +23,9 @@ PROJECT = PYPROJECT["project"]
 DISTRIBUTIONS = {
     "annotated_types": "annotated-types",
     "cv2": "opencv-python-headless",
+    "google": "protobuf",
+    "mcap_protobuf": "mcap-protobuf-support",
+    "octomap": "octomap-python",
     "PIL": "pillow",
     "mpl_toolkits": "matplotlib",
     "orbax": "orbax-checkpoint",

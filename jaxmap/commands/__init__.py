@@ -7,7 +7,7 @@ COMMANDS: dict[str, str] = {
     "check": "say what is wrong with a sequence before it is mapped",
     "perceive": "match and label every frame once, and keep what was seen",
     "map": "map a stereo sequence",
-    "train": "train or fine-tune DeepLabv3+ on images and masks",
+    "train": "train or fine-tune DeepLabv3+, FCN-8s, SegNet or U-Net on images and masks",
     "refine": "refine poses, camera mounting and stereo calibration until frames agree",
     "explain": "tell which frames and pixels made a cell of a map",
     "merge": "add the maps of several sessions",

@@ -12,6 +12,7 @@ from typing import Any, Protocol, TypeVar
 import tyro
 
 from jaxmap.errors import UsageError
+from jaxmap.host.settings import count
 
 Arguments = TypeVar("Arguments")
 
@@ -40,6 +41,20 @@ def parse(
         defaults["default"] = with_config(name)
     words = [long for word in words for long in SHORT.get(word, (word,))]
     return tyro.cli(kind, prog=f"jaxmap {command}", args=words, **defaults)
+
+
+Workers = count(1024)
+"""The bounds of `--workers`."""
+
+
+def check_workers(workers: int | None, scheduler: str | None) -> None:
+    """Refuses processes of this machine beside those of a cluster.
+
+    Raises:
+        UsageError: both are given.
+    """
+    if scheduler is not None and (workers or 1) > 1:
+        raise UsageError("--workers and --scheduler exclude each other", fix="give one of them")
 
 
 def check_bounds(arguments: object, command: str) -> None:

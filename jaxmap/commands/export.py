@@ -25,7 +25,7 @@ class ExportArguments:
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
-    format: tuple[Literal[(*FORMATS, "colmap")], ...] = OF_EACH_RUN  # pyright: ignore[reportInvalidTypeForm]
+    format: tuple[Literal[tuple(FORMATS)], ...] = OF_EACH_RUN  # pyright: ignore[reportInvalidTypeForm]
     """What to write; several at once are separated by spaces."""
     colours: Literal["classes", "images"] = "classes"
     """Colours of points and surfaces: of their classes, or of the run's key frames."""
@@ -41,16 +41,14 @@ def main(words: Sequence[str]) -> int:
 
     folder, console = RunFolder(arguments.run), Console()
     folder.settle_for_reading()
-    formats = [form for form in arguments.format if form != "colmap"]
-    written: list[str] = []
-    if formats:
-        with console.steps("exporting", "forms", len(formats)) as advance:
-            options = dict(colours=arguments.colours, notify=console.notify, advance=advance)
-            written += write_exports(folder, open_map(folder.map), formats, **options)
-    if "colmap" in arguments.format:
-        from jaxmap.runs.colmap import export_colmap
-
-        with console.counted("images", "images") as count:
-            written += export_colmap(folder, console.notify, count)
+    with console.steps("exporting", "forms", len(arguments.format)) as advance:
+        written = write_exports(
+            folder,
+            open_map(folder.map),
+            arguments.format,
+            colours=arguments.colours,
+            notify=console.notify,
+            advance=advance,
+        )
     console.result(arguments.run, written)
     return 0

@@ -7,14 +7,18 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from annotated_types import Interval
 
-from jaxmap.commands.console import Console, check_bounds, parse
+from jaxmap.commands.console import Console, Workers, check_bounds, check_workers, parse
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import NotNegative
 from jaxmap.runs.config import MapConfig, config_of_observations, load_config, observations_in
+
+if TYPE_CHECKING:
+    from jaxmap.runs.folder import RunFolder
 
 OUTPUTS = (
     *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
@@ -46,9 +50,19 @@ class MapArguments:
     """Keep what is perceived on the way as observations.zarr in the run folder, as jaxmap perceive does."""
     checkpoint_every_s: Annotated[float, NotNegative] = 30.0
     """How often the map is saved on the way."""
+    workers: Annotated[int, Workers] | None = None
+    """Processes on this machine that share the work: frames are perceived apart, then regions of the map are fused
+    apart, whose bounds are whole tiles. The map is the same, to the bit, for any number of them."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, tcp://HOST:8786, whose workers share the work instead; docs/clusters.md."""
+    update: bool = False
+    """Bring the run of these observations that lies in the folder up to date: what frames that are new, gone or of
+    other poses (--poses) touch, or what is damaged on disk, is fused again, and the rest stays."""
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
     TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
+    devices: Annotated[int, Interval(ge=1)] | None = None
+    """On how many GPUs frames are fused, one on each at a time; by default on all. A CPU is one device."""
     view: bool = False
     """Show the run in the viewer of rerun while it goes on (pip install 'jaxmap[view]')."""
     view_save: Path | None = None
@@ -64,12 +78,15 @@ def main(words: Sequence[str]) -> int:
         if arguments.keep_observations:
             raise UsageError("--keep-observations keeps those of a sequence", where=perceived, fix="leave it out")
     config = arguments.settings
-    if arguments.resume and arguments.overwrite:
-        raise UsageError("--resume and --overwrite exclude each other", fix="give one of them")
+    ways = [name for name in ("resume", "overwrite", "update") if getattr(arguments, name)]
+    if len(ways) > 1:
+        raise UsageError(f"{' and '.join(f'--{name}' for name in ways)} exclude each other", fix="give one of them")
     check_bounds(arguments, "map")
+    check_workers(arguments.workers, arguments.scheduler)
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.mapping.devices import choose_devices
     from jaxmap.report.recording import check_viewer
     from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.mapping import run_plan, unwatched
@@ -84,9 +101,13 @@ def main(words: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     folder = RunFolder(arguments.out)
+    if arguments.workers is not None or arguments.scheduler is not None or arguments.update:
+        metrics = _map_shared(arguments, folder, console)
+        return _tell(arguments, metrics, console)
     with console.counted("odometry", "frames") as on_frame:
         keep = arguments.keep_observations
         plan = plan_run(arguments.sequence, config, console.notify, on_frame, keep=keep, in_tiles=True)
+    devices = choose_devices(arguments.devices, plan.members)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite
     with (
@@ -104,7 +125,36 @@ def main(words: Sequence[str]) -> int:
             on_frame=advance,
             watch=watch,
             profile=arguments.profile,
+            devices=devices,
         )
+    return _tell(arguments, metrics, console)
+
+
+def _map_shared(arguments: MapArguments, folder: RunFolder, console: Console) -> dict[str, Any]:
+    """Maps on workers, or brings a run up to date."""
+    from jaxmap.host import executors
+    from jaxmap.runs.fusing import map_observations, map_on_workers
+
+    if arguments.profile:
+        raise UsageError("workers are not profiled", where="--profile", fix="leave --profile or the workers out")
+    workers = executors.Workers(arguments.workers or 1, arguments.scheduler)
+    config, tell = arguments.settings, (console.notify, console.steps)
+    if observations_in(arguments.sequence) is not None:
+        ways = {"resume": arguments.resume, "overwrite": arguments.overwrite, "update": arguments.update}
+        return map_observations(arguments.sequence, config, folder, workers, *tell, **ways)
+    if arguments.update:
+        raise UsageError(
+            "--update brings a map of observations up to date",
+            where=arguments.sequence,
+            fix="give the folder that jaxmap perceive has written",
+        )
+    ways = {"resume": arguments.resume, "overwrite": arguments.overwrite, "keep": arguments.keep_observations}
+    return map_on_workers(arguments.sequence, config, folder, workers, *tell, **ways)
+
+
+def _tell(arguments: MapArguments, metrics: dict[str, Any], console: Console) -> int:
+    """Says what a run did, and where its outputs are."""
+    config, keep = arguments.settings, arguments.keep_observations
     console.notify(summary(metrics))
     for skipped in metrics["sequence"]["skipped"]:
         console.notify(f"skipped {skipped['frame']}: {skipped['reason']}")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from jaxmap.commands.console import Console, parse
+from jaxmap.commands.console import Console, Workers, check_bounds, check_workers, parse
 from jaxmap.runs.config import PerceiveConfig, load_perception
 
 OUTPUTS = ("observations.zarr", "config.yaml", "metrics.json", "pictures/")
@@ -34,6 +35,10 @@ class PerceiveArguments:
     aside."""
     overwrite: bool = False
     """Replace observations that lie in the folder; they stay until the new ones are whole."""
+    workers: Annotated[int, Workers] = 1
+    """Processes on this machine that perceive at the same time."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, tcp://HOST:8786, whose workers perceive instead."""
     settings: Annotated[PerceiveConfig, tyro.conf.arg(name="")] = field(default_factory=PerceiveConfig)
 
 
@@ -41,15 +46,22 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(PerceiveArguments, "perceive", words, with_config=_with_config)
     config = arguments.settings
+    check_bounds(arguments, "perceive")
 
     # JAX is imported only now: help and wrong options need not wait for it.
     from jaxmap.fusion.options import FusionOptions
+    from jaxmap.host import executors
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.perceiving import make_keeper, observing, resolved_settings, run_perception
+    from jaxmap.runs.perceiving_shared import check_shareable, keep_on_workers
     from jaxmap.runs.perception import plan_perception
 
     keep_compiled_programs()
+    workers = executors.Workers(arguments.workers, arguments.scheduler)
+    check_workers(arguments.workers, arguments.scheduler)
+    if workers.shared:
+        check_shareable(config)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     folder = RunFolder(arguments.out)
@@ -63,7 +75,10 @@ def main(words: Sequence[str]) -> int:
         observing(folder, settings, overwrite=arguments.overwrite, notify=console.notify) as work,
         console.steps("perceiving", "frames", len(seen.sequence.frames)) as advance,
     ):
-        metrics = run_perception(keeper, work, strict=config.strict, notify=console.notify, on_frame=advance)
+        keep = None
+        if workers.shared:
+            keep = partial(keep_on_workers, keeper, config, work, workers=workers, notify=console.notify)
+        metrics = run_perception(keeper, work, strict=config.strict, notify=console.notify, on_frame=advance, keep=keep)
     sequence, times = metrics["sequence"], metrics["times"]
     console.notify(
         f"{sequence['kept']} of {sequence['frames']} frames are kept, {metrics['bytes_per_frame'] / 1e6:.2f} MB each; "

@@ -1,4 +1,4 @@
-"""`jaxmap train`: trains or fine-tunes DeepLabv3+."""
+"""`jaxmap train`: trains or fine-tunes a segmentation network."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ OUTPUTS = ("report.html", "model.safetensors", "history.csv", "metrics.json", "c
 
 @dataclass(frozen=True)
 class TrainArguments:
-    """Train or fine-tune DeepLabv3+ on images and masks, or on a stereo sequence and an orthomosaic.
+    """Train or fine-tune a segmentation network on images and masks, or on a stereo sequence and an orthomosaic.
 
+    It is DeepLabv3+, or with --network.kind FCN-8s (fcn), SegNet or U-Net, on one of several backbones.
     The folder holds images/NAME.{png,jpg,...} and masks/NAME.png, and may hold train.txt and val.txt of names.
     With --supervision map it is a sequence, as of jaxmap map, or sample:NAME, and no image is labelled: the network
     (the bundled one without --init) learns to make the map that the orthomosaic of --ground-truth shows.

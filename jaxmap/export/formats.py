@@ -32,6 +32,7 @@ FORMATS: dict[str, Format] = {
     "gridmap": Format(("grid_map.mcap",), "jaxmap.export.grid_map:write_grid_map"),
     "foxglove": Format(("foxglove.mcap",), "jaxmap.export.foxglove:write_foxglove"),
     "lac": Format(("lac.npy",), "jaxmap.export.lunar_challenge:write_lunar_challenge"),
+    "colmap": Format(("colmap",), "jaxmap.runs.colmap:export_colmap"),
 }
 """All forms, by the names of `jaxmap export --format`."""
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxmap.export.source import Source, Track, optional, quaternions
+from jaxmap.export.source import Camera, Source, Track, optional
 from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE
 
-WORLD, CAMERA, RECTIFIED = "map", "camera_left", "camera_left_rectified"
+WORLD, CAMERA = "map", "camera_left"
 _UINT8, _FLOAT32 = 1, 7
 _MOST_CELLS = 1 << 23
 _MOST_COLUMNS = 1 << 24
@@ -24,7 +24,7 @@ _PACKAGES = "mcap-protobuf-support and foxglove-schemas-protobuf"
 def write_foxglove(source: Source, path: Path) -> None:
     """Writes Foxglove's own messages, relative to the site origin, in the frame `map`: x east, y north, z up.
 
-    At its time, each pose of the left camera (`/tf`) and each key frame with its camera (`/camera/image`,
+    At its time, each pose of the rectified left camera (`/tf`) and each key frame with its camera (`/camera/image`,
     `/camera/calibration`). At the first time, so that they are there whatever is shown: the whole path (`/path`), the
     occupied voxels in their true shape (`/map/voxels`, a large map in several topics) and the top-down layers
     (`/map/ground`: colours, label, height, probabilities, hazards). Cells without a surface are transparent.
@@ -52,11 +52,9 @@ def write_foxglove(source: Source, path: Path) -> None:
         for time_s, T, xyzw in zip(track.timestamps_s.tolist(), track.T_world_camera, track.quaternions, strict=True):
             send("/tf", time_s, "FrameTransform", **_transform(CAMERA, T, xyzw))
         for frame in track.key_frames:
-            T, time_s = frame.T_world_camera, frame.timestamp_s
-            send("/tf", time_s, "FrameTransform", **_transform(RECTIFIED, T, quaternions(T[None])[0]))
-            send("/camera/image", time_s, "CompressedImage", frame_id=RECTIFIED, data=frame.image, format="png")
-            if track.camera is not None:
-                send("/camera/calibration", time_s, "CameraCalibration", **_calibration(track))
+            image = dict(data=frame.image, format=frame.form)
+            send("/camera/image", frame.timestamp_s, "CompressedImage", frame_id=CAMERA, **image)
+            send("/camera/calibration", frame.timestamp_s, "CameraCalibration", **_calibration(frame.camera))
 
 
 def _poses(track: Track) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -142,13 +140,11 @@ def _fields(names: Any, kind: int, start: int) -> list[Any]:
     return [_message("PackedElementField", name=n, offset=start + size * i, type=kind) for i, n in enumerate(names)]
 
 
-def _calibration(track: Track) -> dict[str, Any]:
-    camera = track.camera
-    assert camera is not None
-    K = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
-    P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
-    rectification = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-    return dict(frame_id=RECTIFIED, width=camera.width, height=camera.height, K=K, P=P, R=rectification)
+def _calibration(camera: Camera) -> dict[str, Any]:
+    fx, fy, cx, cy, width, height = camera
+    K = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    P = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    return dict(frame_id=CAMERA, width=width, height=height, K=K, P=P, R=np.eye(3).ravel().tolist())
 
 
 def _transform(child: str, T: np.ndarray, xyzw: np.ndarray) -> dict[str, Any]:

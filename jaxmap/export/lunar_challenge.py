@@ -48,7 +48,7 @@ def write_lunar_challenge(source: Source, path: Path) -> None:
         observed = np.asarray(columns.top.observed)
         part, place = np.ix_(*picked), np.ix_(*at)
         height_m[place] = np.where(observed, columns.height_m, np.nan)[part]
-        rock[place] = (np.asarray(columns.top.label) == source.target)[part]
+        rock[place] = np.asarray(columns.top.label)[part] == source.target
         seen += int(observed.sum())
     known = ~np.isnan(height_m)
     if not known.any():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -29,17 +28,18 @@ def write_octomap(source: Source, colour_tree: Path, binary_tree: Path) -> None:
     `.bt` what is occupied is so by the map's own threshold.
 
     Raises:
-        JaxmapError: octomap-python is missing, voxels divide into no cubes, the map is larger than a tree, or the disk
-            refuses.
+        JaxmapError: octomap-python is missing, nothing was observed, voxels divide into no cubes, the map is larger
+            than a tree, or the disk refuses.
     """
     octomap = optional("octomap", "octomap-python", "OctoMap")
     edge_m, parts = _cube(source)
-    shift_m = _lattice_shift(source, edge_m)
+    start, shift_m = _place(source, edge_m)
     colour, binary = octomap.ColorOcTree(edge_m), octomap.OcTree(edge_m)
     for tree in (colour, binary):
         tree.setClampingThresMin(_SURE)
         tree.setClampingThresMax(1 - _SURE)
     for index, log_odds, label, solid in cubes(source, parts):
+        index = index + start
         if np.abs(index).max(initial=0) >= _MOST_INDEX:
             raise JaxmapError(
                 f"a tree of {edge_m:g} m voxels ends {_MOST_INDEX * edge_m:g} m from the origin, the map does not",
@@ -47,7 +47,8 @@ def write_octomap(source: Source, colour_tree: Path, binary_tree: Path) -> None:
                 fix="write LAS, or map with larger voxels",
             )
         points = (index + 0.5) * edge_m
-        colours = source.colours_of(points + shift_m, label)
+        colours = np.zeros((len(points), 3), np.uint8)
+        colours[solid] = source.colours_of(points[solid] + shift_m, label[solid])
         for point, value, rgb, is_solid in zip(
             points, log_odds.tolist(), colours.tolist(), solid.tolist(), strict=True
         ):
@@ -57,6 +58,8 @@ def write_octomap(source: Source, colour_tree: Path, binary_tree: Path) -> None:
         for update in (True, False):
             if len(some := points[solid == update]):
                 binary.updateNodes(some, update, True)
+    if not colour.size():
+        raise JaxmapError("nothing was observed: there is no tree of it", where=source.where, fix="see its report")
     colour.updateInnerOccupancy()
     binary.updateInnerOccupancy()
     for path, content in ((colour_tree, colour.write()), (binary_tree, binary.writeBinary())):
@@ -86,8 +89,9 @@ def cubes(source: Source, parts: Int[np.ndarray, "3"]) -> Iterator[_Cubes]:
         label = np.asarray(voxel_labels(voxel_map, params, rule))[own][here]
         low = [side.indices(size)[0] for side, size in zip(own, voxel_map.grid.shape[:2], strict=True)]
         index = (at + np.asarray(voxel_map.grid.first) + [*low, 0]) * parts
-        each = [np.repeat(column, len(within)) for column in (values[0][here].astype(np.float64) + prior, label, solid)]
-        yield (index[:, None] + within).reshape(-1, 3), *each
+        log_odds = values[0][here].astype(np.float64) + prior
+        log_odds, label, solid = (np.repeat(column, len(within)) for column in (log_odds, label, solid))
+        yield (index[:, None] + within).reshape(-1, 3), log_odds, label, solid
 
 
 def _cube(source: Source) -> tuple[float, Int[np.ndarray, "3"]]:
@@ -110,8 +114,9 @@ def _cube(source: Source) -> tuple[float, Int[np.ndarray, "3"]]:
     return edge_m, parts
 
 
-def _lattice_shift(source: Source, edge_m: float) -> Any:
-    """What the lattice of the map lies off multiples of the edge, metres."""
-    lattice_m = np.asarray(source.reader.grid.lattice_m, np.float64)
-    off_m = lattice_m - np.floor(lattice_m / edge_m + 1e-6) * edge_m
-    return np.where(np.abs(off_m) < 1e-6 * edge_m, 0.0, off_m)
+def _place(source: Source, edge_m: float) -> tuple[Int[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Where the lattice of the map begins: whole edges, and the rest in metres, which a tree cannot hold."""
+    lattice_m = np.round(source.corner_m - np.asarray(source.reader.grid.first) * source.size_m, 9)
+    edges = np.floor(lattice_m / edge_m + 1e-6).astype(int)
+    rest_m = lattice_m - edges * edge_m
+    return edges, np.where(np.abs(rest_m) < 1e-6 * edge_m, 0.0, rest_m)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,6 +21,7 @@ from jaxmap.fusion.params import FusionParams, stored_fusion
 from jaxmap.fusion.query import TopDown, top_down
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.labels import IGNORE, class_colours
+from jaxmap.mapping.arrays import TILE
 from jaxmap.mapping.store import MapReader
 
 Colours = Callable[[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N"]], UInt8[np.ndarray, "N 3"]]
@@ -54,45 +55,50 @@ class Columns(NamedTuple):
         return height_m if surface is None else np.where(self.top.observed & ~np.isnan(surface), surface, height_m)
 
 
+class Camera(NamedTuple):
+    """A rectified camera: focal lengths, principal point and size of its image, in pixels."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+
+
 class KeyFrame(NamedTuple):
-    """A frame of which the run kept the rectified left image (PNG)."""
+    """A frame of which the run kept a picture.
+
+    Attributes:
+        timestamp_s: its time.
+        T_world_camera: pose of the rectified left camera, relative to the site origin.
+        camera: of the picture.
+        image: the content of its file.
+        form: `png` or `webp`.
+    """
 
     timestamp_s: float
     T_world_camera: Float64[np.ndarray, "4 4"]
+    camera: Camera
     image: bytes
-
-
-class Pinholes(NamedTuple):
-    """The rectified left camera: focal lengths, principal point and size of the image, in pixels."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
+    form: str
 
 
 @dataclass(frozen=True)
 class Track:
-    """Where the left camera was: poses in the map's world, relative to the site origin, and what it saw."""
+    """Where the rectified left camera was, relative to the site origin, and its key frames."""
 
     timestamps_s: Float64[np.ndarray, "N"] = field(default_factory=lambda: np.zeros(0))
     T_world_camera: Float64[np.ndarray, "N 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    camera: Pinholes | None = None
     key_frames: Sequence[KeyFrame] = ()
 
     @property
     def quaternions(self) -> Float64[np.ndarray, "N 4"]:
         """The rotations of the poses as x, y, z, w."""
-        return quaternions(self.T_world_camera)
+        from scipy.spatial.transform import Rotation
 
-
-def quaternions(T: Float64[np.ndarray, "N 4 4"]) -> Float64[np.ndarray, "N 4"]:
-    """The rotations of transforms as x, y, z, w."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True).reshape(-1, 4) if len(T) else np.zeros((0, 4))
+        rotations = self.T_world_camera[:, :3, :3]
+        return Rotation.from_matrix(rotations).as_quat(canonical=True) if len(rotations) else np.zeros((0, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +180,12 @@ class Source:
             at = voxels.index[:, :2]
             keep = ((at >= low) & (at < high)).all(axis=-1)
             if keep.any():
-                moved = voxels.index[keep] + np.array([*(corner - low), 0], np.int32)
-                yield OccupiedVoxels(
-                    moved, voxels.centres_world[keep], voxels.label[keep], voxels.probability[keep], voxels.voxel_size_m
-                )
+                index = voxels.index + np.array([*(corner - low), 0], np.int32)
+                # In the order of the tiles: a map in memory is written as it is from disk.
+                tile = index[:, :2] // TILE[:2]
+                order = np.lexsort((tile[:, 1], tile[:, 0]))
+                order = order[keep[order]]
+                yield OccupiedVoxels(index[order], *(leaf[order] for leaf in voxels[1:4]), voxels.voxel_size_m)
 
     def columns(self, margin: int = 0) -> Iterator[Columns]:
         """The top-down map, block by block, with as many columns around each as there are."""
@@ -217,9 +225,9 @@ class Source:
             raise JaxmapError(
                 f"{width} x {depth} cells are more than the {most_cells:,} that one map of {form} holds",
                 where=self.where,
-                fix="map with larger voxels, or within bounds (--grid)",
+                fix="map with larger voxels, or within --grid.lower-m and --grid.upper-m",
             )
-        whole = _unknown_columns(len(self.classes), (width, depth))
+        whole: Any = unknown_top(len(self.classes), (width, depth))
         layers = {name: np.full((width, depth), np.nan, np.float32) for name in self.reader.attributes.layers}
         for corner, top, known, _ in self.columns():
             start = np.asarray(corner) - low
@@ -247,13 +255,13 @@ class Source:
         return columns
 
 
-def _unknown_columns(classes: int, shape: tuple[int, int]) -> TopDown:
-    return TopDown(
-        np.full((classes, *shape), np.nan, np.float32),
-        np.full(shape, IGNORE, np.uint8),
-        np.full(shape, np.nan, np.float32),
-        np.zeros(shape, bool),
-    )
+def unknown_top(classes: int, shape: tuple[int, int]) -> TopDown:
+    """A top-down map of which nothing is known yet, NumPy."""
+    probability: Any = np.full((classes, *shape), np.nan, np.float32)
+    label: Any = np.full(shape, IGNORE, np.uint8)
+    height_m: Any = np.full(shape, np.nan, np.float32)
+    observed: Any = np.zeros(shape, bool)
+    return TopDown(probability, label, height_m, observed)
 
 
 def absolute(layers: Mapping[str, Float[np.ndarray, "X Y"]], site_z_m: float) -> dict[str, Float[np.ndarray, "X Y"]]:

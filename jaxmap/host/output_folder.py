@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -66,8 +66,13 @@ def check_inputs_stay(outputs: Iterable[Path], inputs: Iterable[Path | None]) ->
             raise UsageError("an input would be overwritten", where=path, fix="choose another --out")
 
 
-def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
+def check_same_settings(path: Path, tree: dict[str, Any], free: Collection[str] = ()) -> None:
     """Compares the current settings with those that a run was started with.
+
+    Args:
+        path: the file of those.
+        tree: the current ones.
+        free: the names of those that may differ.
 
     Raises:
         JaxmapError: the file cannot be read.
@@ -81,7 +86,9 @@ def check_same_settings(path: Path, tree: dict[str, Any]) -> None:
         raise JaxmapError(error.what, where=error.where, fix="start anew with --overwrite") from error
     before = before if isinstance(before, dict) else {}
     before, tree = dotted(before), dotted(tree)
-    differing = sorted(key for key in before.keys() | tree.keys() if before.get(key) != tree.get(key))
+    differing = sorted(
+        key for key in before.keys() | tree.keys() if key not in free and before.get(key) != tree.get(key)
+    )
     if differing:
         raise UsageError(
             f"the run was begun with another {', '.join(differing)}",

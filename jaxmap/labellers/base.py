@@ -91,6 +91,7 @@ class Labeller(NamedTuple):
         ground: where it asks for the relief of the cloud, the ground to measure it from.
         perceive: `(frame, cloud, params) -> logits`, where the labeller sees the image: all that its features take
             from there. What perceives and what fuses may be apart (`labellers.deeplab.make_logits_labeller`).
+        draws: its labels depend on the key, and so on how many frames were fused before.
     """
 
     name: str
@@ -104,6 +105,7 @@ class Labeller(NamedTuple):
     bijectors: Mapping[str, Bijector] = {}
     soft: bool = False
     ground: GroundOptions | None = None
+    draws: bool = True
     perceive: Callable[[Frame, PointCloud, LabellerParams], Float[Array, "h w C"]] | None = None
 
 
@@ -160,7 +162,7 @@ def make_no_labeller() -> Labeller:
     def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array]:
         return (jnp.full(values.shape[:1], IGNORE, jnp.int32),)
 
-    return Labeller("none", (), None, features, label)
+    return Labeller("none", (), None, features, label, draws=False)
 
 
 def harden(labels: PointLabels) -> PointLabels:

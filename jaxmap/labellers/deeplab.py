@@ -1,4 +1,7 @@
-"""The network as a labeller: DeepLab inside the compiled step, its classes turned into the map's."""
+"""A segmentation network as a labeller, inside the compiled step, its classes turned into the map's.
+
+The bundled one is a DeepLabv3+, which gave the labeller its name; the model file says which kind of network it holds.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from jaxmap.labellers.relief import floating_points, ground_seen
 from jaxmap.labels import IGNORE
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import fold_batch_norm, pure_network
+from jaxmap.models.network import fold_batch_norm, pure_network
 from jaxmap.models.pixelwise import map_pixels, resized_input, upsampling
 from jaxmap.models.tensor_files import shortened
 from jaxmap.types import Frame, to_device
@@ -180,6 +183,7 @@ def make_logits_labeller(
         bijectors={"temperature": positive(0.02, 50.0)},
         soft=options.soft,
         ground=ground,
+        draws=False,
     )
 
 

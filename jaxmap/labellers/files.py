@@ -25,4 +25,4 @@ def make_files_labeller(classes: Sequence[str], *, soft: bool) -> Labeller:
     def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
         return tuple(values[:, c] for c in range(len(classes))) if soft else (values[:, 0].astype(jnp.int32),)
 
-    return Labeller("files", tuple(classes), needs, features, label, soft=soft)
+    return Labeller("files", tuple(classes), needs, features, label, soft=soft, draws=False)

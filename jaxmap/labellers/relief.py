@@ -99,6 +99,7 @@ def make_relief_labeller(classes: Sequence[str], options: ReliefOptions | None =
         bijectors=_BIJECTORS,
         soft=True,
         ground=options,
+        draws=False,
     )
 
 

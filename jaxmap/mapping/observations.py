@@ -321,10 +321,12 @@ class Observations:
         return Observation(ref.name, ref.timestamp_s, pose, disparity_px, values, stored.too_near, stored.nearest_px)
 
     def picture(self, index: int) -> Path | None:
-        """Where the rectified left image of a frame is kept, if it is."""
+        """Where the rectified left image of a frame is kept, if it is: a PNG, or a smaller WebP."""
         number = self.attributes.key_frames.get(self.frames[index].name)
-        path = None if number is None else self.folder.parent / "pictures" / f"{number:06d}_left.png"
-        return path if path is not None and path.is_file() else None
+        if number is None:
+            return None
+        paths = [self.folder.parent / "pictures" / f"{number:06d}_left.{ending}" for ending in ("png", "webp")]
+        return next((path for path in paths if path.is_file()), None)
 
     def selected(self, chosen: slice | Sequence[int] | np.ndarray) -> Observations:
         """Some of the frames."""

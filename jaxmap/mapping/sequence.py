@@ -25,6 +25,9 @@ from jaxmap.mapping.step import Mapper, MapperParams, StepCost, StepReport, comp
 from jaxmap.stereo.front_end import RectifiedFrame, StereoFrontEnd
 from jaxmap.types import Frame, StereoCamera, VoxelMap, to_device
 
+Cover = Callable[[VoxelMap, Sequence[int]], VoxelMap]
+"""From a part of a map to the part that holds the views of frames, given their indices."""
+
 
 @dataclass(frozen=True)
 class PreparedFrame:
@@ -114,7 +117,7 @@ def observed_frames(
     *,
     left_image: Callable[[FrameRef], ImageArray] | None = None,
     pose_errors: Float[np.ndarray, "N M 6"] | None = None,
-    first: int = 0,
+    indices: Sequence[int] | None = None,
     workers: int = 2,
     ahead: int = 4,
 ) -> Iterator[PreparedFrame]:
@@ -125,7 +128,7 @@ def observed_frames(
         left_image: reads the rectified left image of a frame, which is then delivered, as RGB, in place of the labels
             that are kept.
         pose_errors: of the members of an ensemble, for each frame.
-        first: index of the first frame.
+        indices: which frames; by default all.
         workers: threads.
         ahead: frames in the making or waiting.
     """
@@ -140,7 +143,7 @@ def observed_frames(
                 if left_image is not None:
                     left = left_image(ref)
                 elif picture is not None:
-                    left = read_image(picture)
+                    left = _at_full_size(read_image(picture), observations.camera)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         assert prepared.rectified is not None and prepared.frame is not None
@@ -152,7 +155,14 @@ def observed_frames(
             frame = replace(frame, **kept | {"image": to_device(as_rgb(left))})
         return replace(prepared, frame=frame, rectified=rectified, stages_s=stages_s)
 
-    return prefetch(prepare, range(first, len(observations.frames)), workers, ahead)
+    return prefetch(prepare, range(len(observations.frames)) if indices is None else indices, workers, ahead)
+
+
+def _at_full_size(picture: ImageArray, camera: StereoCamera) -> ImageArray:
+    """A picture of a key frame, which may have been kept small, at the size of the images."""
+    import cv2
+
+    return cv2.resize(picture, (camera.width_px, camera.height_px))
 
 
 def as_prepared(
@@ -211,7 +221,7 @@ def run_sequence(
     *,
     strict: bool = False,
     form: Frame | None = None,
-    cover: Callable[[VoxelMap, int], VoxelMap] = lambda voxel_map, index: voxel_map,
+    cover: Cover = lambda voxel_map, indices: voxel_map,
 ) -> Iterator[tuple[VoxelMap, FusedFrame]]:
     """Fuses prepared frames one after the other.
 
@@ -224,7 +234,8 @@ def run_sequence(
         strict: stop at a frame that cannot be used.
         form: that of the frames (`frame_form`): the step is compiled for it while the first ones are read. Without it,
             the first frame that is ready compiles the step.
-        cover: of a map that is a part of a larger one: moves it so that it holds the view of a frame, given its index.
+        cover: of a map that is a part of a larger one: moves it so that it holds the views of frames, given their
+            indices.
 
     Yields:
         After each frame, the map so far and what became of the frame. The map is donated to the
@@ -237,7 +248,7 @@ def run_sequence(
     if form is not None:
         mapper, cost = compile_step(mapper, voxel_map, form, params, key)
         news = cost
-    for prepared in _timed(frames):
+    for prepared in timed_frames(frames):
         if prepared.frame is None:
             if strict and prepared.fault is not None:
                 raise prepared.fault
@@ -247,14 +258,14 @@ def run_sequence(
             mapper, cost = compile_step(mapper, voxel_map, prepared.frame, params, key)
             news = cost
         with timed_stage("step", prepared.stages_s):
-            voxel_map = cover(voxel_map, prepared.index)
+            voxel_map = cover(voxel_map, [prepared.index])
             voxel_map, info = mapper.step(voxel_map, prepared.frame, params, key)
             jax.block_until_ready(voxel_map.log_odds)
         yield voxel_map, FusedFrame(prepared, info, news)
         news = None
 
 
-def _timed(frames: Iterable[PreparedFrame]) -> Iterator[PreparedFrame]:
+def timed_frames(frames: Iterable[PreparedFrame]) -> Iterator[PreparedFrame]:
     """The same frames; how long each was waited for is one of its stages."""
     source = iter(frames)
     while True:

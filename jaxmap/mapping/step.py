@@ -26,7 +26,7 @@ from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
 from jaxmap.labels import IGNORE
-from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
+from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_voxel_map
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -94,14 +94,46 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
     return exact
 
 
+class FrameEvidence(NamedTuple):
+    """What one frame says, before it is added to a map.
+
+    `evidence` is that of the voxels of `window`; `labels` are those that its points are fused with;
+    `heights` are the statistics of the columns of the window, where they are kept.
+    """
+
+    evidence: Float[Array, "C1 X Y Z"]
+    window: GridSpec
+    labels: PointLabels
+    report: StepReport
+    heights: Float[Array, "4 X Y"] | None = None
+
+
 @in_full_float32
 def fuse_frame(
     design: StepDesign, voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray
 ) -> tuple[VoxelMap, StepReport]:
     """The step itself: one frame into the map. `key` is the run's."""
-    labeller, rule, depth_range_m, shape, members = design
-    grid, camera, pose, fusion = voxel_map.grid, params.camera, frame.T_world_camera, params.fusion
     frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
+    seen = see_frame(design, voxel_map.grid, frame, params, frame_key)
+    fused = add_evidence(voxel_map, seen.evidence, seen.window)
+    if design.members:
+        assert params.ensemble is not None
+        _, rule, depth_range_m, shape, _ = design
+        camera, draws = params.camera, params.ensemble
+        own = fuse_members(voxel_map, frame, seen.labels, camera, draws, frame_key, rule, depth_range_m, shape)
+        fused = replace(fused, members=own)
+    if voxel_map.surface is not None and seen.heights is not None:
+        fused = replace(fused, surface=add_heights(voxel_map, seen.heights, seen.window))
+    return fused, seen.report
+
+
+@in_full_float32
+def see_frame(
+    design: StepDesign, grid: GridSpec, frame: Frame, params: MapperParams, frame_key: PRNGKeyArray
+) -> FrameEvidence:
+    """What a frame says of the voxels of a grid that it can see: all of the step but the sum."""
+    labeller, rule, depth_range_m, shape, _ = design
+    camera, pose, fusion = params.camera, frame.T_world_camera, params.fusion
 
     cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
@@ -111,17 +143,12 @@ def fuse_frame(
     if rule.carve:
         free = carve(camera, pose, cloud.depth_m, cloud.valid, window, fusion, depth_range_m)
     weights = point_weights(grid, cloud, rule)
-    counts = count_points(window, cloud.points_world, labels, weights, len(voxel_map.classes))
-    fused = add_evidence(voxel_map, frame_evidence(counts, free, fusion, rule), window)
-    if members:
-        assert params.ensemble is not None
-        own = fuse_members(voxel_map, frame, labels, camera, params.ensemble, frame_key, rule, depth_range_m, shape)
-        fused = replace(fused, members=own)
+    counts = count_points(window, cloud.points_world, labels, weights, len(labeller.classes))
 
-    if fused.surface is not None:
+    heights = None
+    if rule.surface:
         sigma_m = height_sigma(cloud, pose.translation()[2])
         heights = gather_heights(window, cloud.points_world, sigma_m, labels.keep)
-        fused = replace(fused, surface=add_heights(voxel_map, heights, window))
 
     hits, freed = _count_voxels(total_weight(counts) > 0, free)
     report = StepReport(
@@ -132,7 +159,7 @@ def fuse_frame(
         voxels_freed=freed,
         estimate=estimate,
     )
-    return fused, report
+    return FrameEvidence(frame_evidence(counts, free, fusion, rule), window, labels, report, heights)
 
 
 def _count_voxels(
@@ -181,6 +208,7 @@ class Mapper(NamedTuple):
     """The pure functions of a mapper.
 
     Attributes:
+        design: what was decided before the step was compiled.
         init: `() -> VoxelMap`, an empty map.
         step: `(voxel_map, frame, params, key) -> (voxel_map, StepReport)`, compiled once; the map
             passed in is donated: its tensor must not be used again. The key is the run's: the step folds
@@ -190,17 +218,16 @@ class Mapper(NamedTuple):
             a leading axis, equal to a loop over `step`.
         label_image: `(frame, params, key, number) -> uint8 (H, W)`, the labels that the step gives
             the pixels of the frame when `number` frames were fused before it; `IGNORE` where none.
-        design: what was decided before the step was compiled.
         lower: the arguments of `step` -> `jax.stages.Lowered`, for its cost, memory and HLO.
         compilations: how often `step` has been compiled so far.
     """
 
+    design: StepDesign
     init: Callable[[], VoxelMap]
     step: Step
     fuse: Step
     scan: Step
     label_image: Callable[[Frame, MapperParams, PRNGKeyArray, int], UInt8[Array, "H W"]]
-    design: StepDesign
     lower: Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], jax.stages.Lowered]
     compilations: Callable[[], int]
 
@@ -246,7 +273,7 @@ def make_mapper(
     design = StepDesign(labeller, rule, depth_range_m, shape, members)
 
     def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepReport]:
-        _check_inputs(design, frame, params)
+        check_inputs(design, frame, params)
         return fuse_frame(design, voxel_map, frame, params, key)
 
     def scan(
@@ -255,21 +282,32 @@ def make_mapper(
         return jax.lax.scan(lambda carried, frame: fuse(carried, frame, params, key), voxel_map, frames)
 
     def label(frame: Frame, params: MapperParams, key: PRNGKeyArray, number: Int[Array, ""]) -> UInt8[Array, "H W"]:
-        _check_inputs(design, frame, params)
+        check_inputs(design, frame, params)
         return label_image(design, frame, params, key, number)
 
-    def fuse_donated(tensors: _Tensors, rest: VoxelMap, *inputs: Any) -> tuple[VoxelMap, StepReport]:
+    mapper = Mapper(
+        design=design,
+        init=lambda: make_voxel_map(grid, labeller.classes, members, surface=rule.surface),
+        step=fuse,
+        fuse=fuse,
+        scan=jax.jit(scan),
+        label_image=jax.jit(label),
+        lower=lambda *inputs: jax.jit(fuse).lower(*inputs),
+        compilations=lambda: 0,
+    )
+    return with_step(mapper, fuse)
+
+
+def with_step(mapper: Mapper, fuse: Callable[..., Any]) -> Mapper:
+    """The mapper with another function, which is compiled, as its step; the map is its first argument and donated."""
+
+    def fuse_donated(tensors: _Tensors, rest: VoxelMap, *inputs: Any) -> Any:
         return fuse(replace(rest, **tensors._asdict()), *inputs)
 
     # Only the tensors are donated: the small arrays of the grid may be shared with other maps.
     compiled: Any = jax.jit(fuse_donated, donate_argnums=0)
-    return Mapper(
-        init=lambda: make_voxel_map(grid, labeller.classes, members, surface=rule.surface),
+    return mapper._replace(
         step=lambda voxel_map, *inputs: compiled(*_apart(voxel_map), *inputs),
-        fuse=fuse,
-        scan=jax.jit(scan),
-        label_image=jax.jit(label),
-        design=design,
         lower=lambda voxel_map, *inputs: compiled.lower(*_apart(voxel_map), *inputs),
         compilations=compiled._cache_size,
     )
@@ -300,7 +338,7 @@ def compile_step(
     return mapper._replace(step=lambda voxel_map, *inputs: executable(*_apart(voxel_map), *inputs)), cost
 
 
-def _check_inputs(design: StepDesign, frame: Frame, params: MapperParams) -> None:
+def check_inputs(design: StepDesign, frame: Frame, params: MapperParams) -> None:
     """Refuses a frame or params that lack what the step needs."""
     labeller = design.labeller
     where = f"{labeller.name} labeller"

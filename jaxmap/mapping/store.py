@@ -66,8 +66,8 @@ def save_map(path: str | os.PathLike[str], voxel_map: VoxelMap, attributes: MapA
             arrays,
             to_json(voxel_map.grid, voxel_map.classes, int(voxel_map.frames_fused), attributes),
         )
-        _sync_tree(temporary)
-        _swap_in(temporary, target)
+        sync_tree(temporary)
+        swap_in(temporary, target)
     except OSError as error:
         raise write_error(error, target) from error
     finally:
@@ -268,7 +268,8 @@ def _write_group(folder: Path, arrays: dict[str, StoredArray], stored: dict[str,
     group.update_attributes(stored | ({"chunks_stored_of": counts} if counts else {}))
 
 
-def _swap_in(temporary: Path, target: Path) -> None:
+def swap_in(temporary: Path, target: Path) -> None:
+    """Puts a map in the place of another, which is there, whole, until then."""
     aside = _set_aside(target)
     replaces = target.exists()
     if replaces:
@@ -293,7 +294,8 @@ def _replaceable(target: Path) -> bool:
     return target.is_dir() and ((target / "zarr.json").exists() or not any(target.iterdir()))
 
 
-def _sync_tree(folder: Path) -> None:
+def sync_tree(folder: Path) -> None:
+    """Waits until all that is in a folder has reached the disk."""
     for parent, _, names in os.walk(folder):
         for name in names:
             sync(Path(parent, name))

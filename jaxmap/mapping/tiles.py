@@ -232,19 +232,40 @@ class MovingBlock:
         """A block at the corner of the grid."""
         return self._load(np.asarray(self.store.grid.first), frames_fused)
 
-    def cover(self, voxel_map: VoxelMap, box: Int[np.ndarray, "2 3"]) -> VoxelMap:
-        """The block, moved where that is needed, so that it holds the voxels of a view, which count as changed.
+    def cover(self, voxel_map: VoxelMap, boxes: Int[np.ndarray, "*n 2 3"]) -> VoxelMap:
+        """The block, moved where that is needed, so that it holds the voxels of views, which count as changed.
 
         Args:
             voxel_map: the block so far; it must not be used again.
-            box: of `geometry.bounds.view_boxes`.
+            boxes: of `geometry.bounds.view_boxes`: one, or those of frames that are fused at once.
+
+        Raises:
+            JaxmapError: no block of its size holds them all.
         """
+        views = boxes.reshape(-1, 2, 3)
+        views = views[(views[:, 1] > views[:, 0]).all(axis=1)]
+        if not len(views):
+            return voxel_map
+        box = np.stack([views[:, 0].min(axis=0), views[:, 1].max(axis=0)])
         first = np.asarray(voxel_map.grid.first)
         if (box[0] < first).any() or (box[1] > first + self._shape).any():
+            self._check_holds(box, len(views))
             self.write_changes(voxel_map)
             voxel_map = self._load(self._around(box), int(voxel_map.frames_fused))
-        self._touched |= set(tiles_of(self.store.grid, box))
+        for view in views:
+            self._touched |= set(tiles_of(self.store.grid, view))
         return voxel_map
+
+    def _check_holds(self, box: Int[np.ndarray, "2 3"], views: int) -> None:
+        """Refuses views that lie too far apart, of which some would be left out."""
+        tiles = -(-box[1] // TILE) - box[0] // TILE
+        if (tiles * TILE > self._shape).any():
+            raise JaxmapError(
+                f"the views of {views} frames fill {' x '.join(map(str, box[1] - box[0]))} voxels, the part of the map "
+                f"in memory has {' x '.join(map(str, self._shape))}",
+                where=self.store.path,
+                fix="raise --grid.max-memory-gib, or fuse fewer frames at once (--devices 1)",
+            )
 
     def write_changes(self, voxel_map: VoxelMap) -> None:
         """Writes the tiles of the block that have changed, to be committed."""

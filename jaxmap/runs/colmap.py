@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from jaxmap.datasets.registry import open_sequence
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.export.colmap import FILES, write_colmap
+from jaxmap.export.source import Source
 from jaxmap.host.bounded_text import read_json, read_yaml
 from jaxmap.host.files import atomic_path
+from jaxmap.mapping.observations import read_attributes
 from jaxmap.report.drive_view import seen_frames
 from jaxmap.report.image_colours import image_colours
-from jaxmap.report.run_contents import read_run
-from jaxmap.runs.config import load_config
+from jaxmap.report.run_contents import find_pictures
+from jaxmap.runs.config import load_config, observations_in
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.run_frames import read_run_frames
 from jaxmap.stereo.front_end import StereoFrontEnd
@@ -24,41 +27,36 @@ IMAGES = "images"
 _QUALITY = 95
 
 
-def export_colmap(folder: RunFolder, notify: Callable[[str], None], advance: Callable[[int, int], None]) -> list[str]:
-    """Writes `RUN/colmap`: the model, and the rectified left images, where the sequence is still at hand.
+def export_colmap(source: Source, out: Path) -> Iterable[Path]:
+    """Writes the model into a folder of the run, and the rectified left images, where the sequence is still at hand.
 
     Points are the occupied voxels in the colours that the key frames show there.
 
-    Args:
-        folder: of the run.
-        notify: takes lines for the user.
-        advance: is told how many images of how many are written.
-
     Returns:
-        The names of what was written.
+        What was written.
 
     Raises:
         JaxmapError: the run has no poses, names or camera, or the disk is full or refuses.
     """
-    contents, out = read_run(folder.path), folder.path / "colmap"
-    site_origin = np.asarray(contents.attributes.site_origin, np.float64)
-    frames = read_run_frames(folder, site_origin)
+    folder = RunFolder(out.parent)
+    frames = read_run_frames(folder, source.site_origin)
     if frames.camera is None or frames.notes:
         raise JaxmapError(frames.notes[0], where=folder.path, fix="map again")
     files = [f"{name}.jpg" for name in frames.names]
-    centres = contents.voxels.centres_world
-    colours = image_colours(centres, [*seen_frames(contents.pictures, contents.group("camera")).values()])
-    write_colmap(out, frames.camera, frames.size_px, files, frames.T_world_camera, centres, colours, site_origin)
-    written = [f"{out.name}/{name}" for name in FILES]
+    centres = np.concatenate([np.zeros((0, 3), np.float32), *(voxels.centres_world for voxels in source.voxels())])
+    key_frames = seen_frames(find_pictures(folder.path), read_json(folder.metrics)["camera"])
+    colours = image_colours(centres, [*key_frames.values()])
+    write_colmap(out, frames.camera, frames.size_px, files, frames.T_world_camera, centres, colours, source.site_origin)
+    written = [out / name for name in FILES]
     try:
-        _write_images(folder, set(frames.names), advance)
+        _write_images(folder, set(frames.names))
     except (JaxmapError, KeyError, TypeError, ValueError) as error:
-        notify(f"note: no images are written ({error}): images.txt names the rectified left ones")
+        source.notify(f"note: no images are written ({error}): images.txt names the rectified left ones")
         return written
-    return [*written, f"{out.name}/{IMAGES}/"]
+    return [*written, out / IMAGES]
 
 
-def _write_images(folder: RunFolder, names: set[str], advance: Callable[[int, int], None]) -> None:
+def _write_images(folder: RunFolder, names: set[str]) -> None:
     """Rectifies the left images of a run once more, as it did, and writes them.
 
     Raises:
@@ -67,6 +65,8 @@ def _write_images(folder: RunFolder, names: set[str], advance: Callable[[int, in
     from PIL import Image
 
     config, source = load_config(str(folder.config)), str(read_yaml(folder.config)["sequence"])
+    if (perceived := observations_in(source)) is not None:
+        source = read_attributes(perceived).sequence
     # Only images are wanted: poses that took long to find are not sought again.
     config = replace(config, poses=folder.poses, poses_world="auto") if str(config.poses) == "odometry" else config
     sequence = open_sequence(source, config)
@@ -84,6 +84,5 @@ def _write_images(folder: RunFolder, names: set[str], advance: Callable[[int, in
         with atomic_path(folder.path / "colmap" / IMAGES / f"{frame.name}.jpg") as temporary:
             Image.fromarray(left).save(temporary, quality=_QUALITY)
         done += 1
-        advance(done, len(names))
     if done < len(names):
         raise JaxmapError(f"{len(names) - done} of {len(names)} images are gone", where=source)

@@ -130,6 +130,15 @@ def config_of_observations(observations: Path, name_or_path: str | None) -> MapC
     return _SETTINGS.check(_over(known, given), where)
 
 
+def absolute_tree(config: PerceiveConfig) -> dict[str, Any]:
+    """A configuration as plain values that mean the same in every folder: for workers."""
+    tree = config_tree(config)
+    for name in ("poses", "calibration", "model", "labels"):
+        if tree.get(name) is not None and Path(tree[name]).exists():
+            tree[name] = str(Path(tree[name]).absolute())
+    return tree
+
+
 def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """Two trees of settings as one."""
     merged = dict(below)

@@ -23,7 +23,7 @@ from jaxmap.mapping.explain import Contribution, make_explainer
 from jaxmap.mapping.sequence import PreparedFrame, prepare_frames
 from jaxmap.mapping.store import Columns, MapReader, open_map
 from jaxmap.report.explain_page import Explanation, FramePart
-from jaxmap.runs.config import load_config
+from jaxmap.runs.config import CHOSEN_ANEW, MapConfig, load_config
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.mapping_plan import Plan, plan_run
@@ -145,10 +145,15 @@ def plan_again(run: Path, cell: Cell, notify: Notify) -> Plan:
     source = tree.get("sequence")
     if not isinstance(source, str):
         raise JaxmapError("it does not say which sequence was mapped", where=folder.config, fix="map it again")
-    plan = plan_run(source, load_config(str(folder.config)), notify, in_tiles=True)
+    config, kept = load_config(str(folder.config)), bool(tree.get("keep_observations")) and folder.observations.exists()
+    if kept:
+        # The map was fused from what was kept, which is rounded; it holds just the frames and poses of the run.
+        source, usual = str(folder.observations), MapConfig()
+        config = replace(config, **{name: getattr(usual, name) for name in CHOSEN_ANEW})
+    plan = plan_run(source, config, notify, in_tiles=True)
     progress = cell.reader.attributes.progress
     done = progress.get("next_index")
-    if not isinstance(done, int) or progress.get("digest") != plan.digest(done):
+    if not isinstance(done, int) or not (kept or progress.get("digest") == plan.digest(done)):
         raise JaxmapError("the frames, poses or camera are not those of the run", where=source, fix="map it again")
     fusion = json.loads(json.dumps(plan.fusion))
     if fusion != cell.reader.attributes.fusion or plan.labeller.classes != cell.reader.classes:

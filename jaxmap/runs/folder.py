@@ -27,7 +27,7 @@ from jaxmap.host.replacement import Replacement
 from jaxmap.mapping.store import MapReader, holds_map, stray_maps
 from jaxmap.report.detail import FOLDER
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
-from jaxmap.runs.config import OBSERVATIONS
+from jaxmap.runs.config import CHOSEN_ANEW, OBSERVATIONS
 from jaxmap.stereo.front_end import RectifiedFrame
 
 _PICTURE_NAME = re.compile(r"\d{6}_(left|disparity|labels)\.(png|webp)")
@@ -52,6 +52,7 @@ class RunFolder:
         self.pose_scores = path / "pose_scores.json"
         self.pictures = path / "pictures"
         self.profile = path / "profile"
+        self.parts = path / ".parts"
         self._replacement = Replacement(path, self._outputs)
 
     def locked(self) -> AbstractContextManager[None]:
@@ -59,16 +60,18 @@ class RunFolder:
         return locked(self.path)
 
     @contextmanager
-    def writing(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> Iterator[RunFolder]:
-        """Begins a run and yields the folder it is to write into, see `begin`.
+    def writing(
+        self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool, update: bool = False
+    ) -> Iterator[RunFolder]:
+        """Begins a run and yields the folder it is to write into, see `begin` and `begin_update`.
 
         A run that is replaced stays until the block has ended without an error.
         """
-        work = self.begin(settings, resume=resume, overwrite=overwrite)
+        work = self.begin_update(settings) if update else self.begin(settings, resume=resume, overwrite=overwrite)
         if work is self:
             yield self
             return
-        with self._replacement.written(keep=lambda: holds_map(work.map)):
+        with self._replacement.written(keep=lambda: holds_map(work.map) or work.parts.exists()):
             yield work
 
     def begin(self, settings: Mapping[str, Any], *, resume: bool | None, overwrite: bool) -> RunFolder:
@@ -89,12 +92,13 @@ class RunFolder:
         self.settle()
         replacing = RunFolder(self._replacement.new)
         # A run that has failed before its first save has left nothing to lose.
-        used = holds_map(self.map) or self.metrics.exists() or self.observations.exists()
+        kept = (self.metrics, self.observations, self.parts)
+        used = holds_map(self.map) or any(path.exists() for path in kept)
         if resume and (replacing.config.exists() or used):
             work = replacing if replacing.config.exists() else self
             check_same_settings(work.config, dict(settings))
             return work
-        if not overwrite and (used or holds_map(replacing.map)):
+        if not overwrite and (used or holds_map(replacing.map) or replacing.parts.exists()):
             going_on = "" if resume is None else "resume it (--resume), "
             raise JaxmapError(
                 "the folder holds a run already",
@@ -106,6 +110,28 @@ class RunFolder:
         if not used:
             self._clear()
         work = replacing if used else self
+        write_yaml(work.config, dict(settings))
+        return work
+
+    def begin_update(self, settings: Mapping[str, Any]) -> RunFolder:
+        """Writes the resolved settings of a run that replaces the one here, and differs from it in frames and poses.
+
+        Returns:
+            Where to write: a folder within, with the parts that an interrupted update has left there.
+
+        Raises:
+            UsageError: there is no run here, or it had other settings.
+        """
+        self.settle()
+        if not holds_map(self.map):
+            raise UsageError(
+                "there is no run to bring up to date", where=self.path, fix="map into it without --update first"
+            )
+        check_same_settings(self.config, dict(settings), CHOSEN_ANEW)
+        work = RunFolder(self._replacement.new)
+        for path in work.path.iterdir() if work.path.exists() else ():
+            if path != work.parts:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
         write_yaml(work.config, dict(settings))
         return work
 
@@ -168,7 +194,8 @@ class RunFolder:
 
     def _outputs(self) -> Iterator[Path]:
         """What an earlier run has written, and nothing else."""
-        yield from (self.map, *stray_maps(self.map), self.observations, self.profile, self.path / FOLDER, *self._files)
+        derived = (self.parts, self.profile, self.path / FOLDER)
+        yield from (self.map, *stray_maps(self.map), self.observations, *derived, *self._files)
         for picture in self.pictures.glob("*"):
             if _PICTURE_NAME.fullmatch(picture.name):
                 yield picture

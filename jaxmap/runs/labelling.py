@@ -97,7 +97,7 @@ def describe_network(model: ModelFile, network: Architecture, classes: Sequence[
     """One line on the network and its classes."""
     count = len(network.classes)
     return (
-        f"labels by {model.path.name} ({network.backbone}, {count} classes), "
+        f"labels by {model.path.name} ({network.name} on {network.backbone}, {count} classes), "
         f"mapped as {shortened(classes)}; the settings classes and deeplab.class_map choose"
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from annotated_types import Interval
@@ -11,7 +11,8 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.geometry_scores import DisparityScores
-from jaxmap.mapping.sequence import FusedFrame
+from jaxmap.mapping.sequence import FusedFrame, PreparedFrame
+from jaxmap.mapping.step import StepReport
 
 MOST_KEPT = 2048
 TOO_NEAR_SHARE = 0.01
@@ -55,6 +56,41 @@ class Sample:
     def percentile(self, percent: float) -> float:
         """Of the numbers that are kept."""
         return float(np.percentile(self.kept, percent))
+
+
+class FrameNumbers(NamedTuple):
+    """What a log keeps of a frame: plain values, the same whatever part of the map it was fused into.
+
+    Attributes:
+        valid_fraction: share of the pixels that have a disparity.
+        points_kept: by the labeller.
+        ground_found: whether the labeller found ground below the camera; None where it looks for none.
+        too_near: share of the pixels that were left out as nearer than the searched disparities reach.
+        nearest_px: the greatest disparity of those.
+    """
+
+    valid_fraction: float
+    points_kept: int
+    ground_found: bool | None
+    too_near: float
+    nearest_px: float
+
+
+def numbers_of(prepared: PreparedFrame, info: StepReport) -> FrameNumbers:
+    """What a log keeps of a fused frame."""
+    rectified = prepared.rectified
+    pixels, too_near, nearest_px = 1, 0.0, 0.0
+    if rectified is not None:
+        pixels, too_near, nearest_px = rectified.disparity_px.size, rectified.too_near, rectified.nearest_px
+    # Of the plane labeller as of those that see relief.
+    found = getattr(info.estimate, "found", None)
+    return FrameNumbers(
+        round(int(info.points_valid) / pixels, 4),
+        int(info.points_kept),
+        None if found is None else bool(found),
+        float(too_near),
+        float(nearest_px),
+    )
 
 
 @dataclass
@@ -109,19 +145,19 @@ class RunLog:
         self.fused += 1
         for name, seconds in prepared.stages_s.items():
             self.stages_ms.setdefault(name, Sample()).add(round(1e3 * seconds, 3))
-        pixels = 1
-        if (rectified := prepared.rectified) is not None:
-            pixels = rectified.disparity_px.size
-            if rectified.too_near > TOO_NEAR_SHARE:
-                self.too_near += 1
-                self.nearest_px = max(self.nearest_px, rectified.nearest_px)
-        self.valid_fractions.add(round(int(fused.info.points_valid) / pixels, 4))
-        self.points_fused += int(fused.info.points_kept)
-        # Of the plane labeller as of those that see relief.
-        if (found := getattr(fused.info.estimate, "found", None)) is not None:
-            self.without_ground = (self.without_ground or 0) + (not bool(found))
+        self.count(numbers_of(prepared, fused.info))
         for name, value in (scores._asdict() if scores else {}).items():
             self.disparity.setdefault(name, Sample()).add(value)
+
+    def count(self, numbers: FrameNumbers) -> None:
+        """Takes note of what one frame has shown."""
+        self.valid_fractions.add(numbers.valid_fraction)
+        self.points_fused += numbers.points_kept
+        if numbers.ground_found is not None:
+            self.without_ground = (self.without_ground or 0) + (not numbers.ground_found)
+        if numbers.too_near > TOO_NEAR_SHARE:
+            self.too_near += 1
+            self.nearest_px = max(self.nearest_px, numbers.nearest_px)
 
     def as_json(self) -> dict[str, Any]:
         """The log as plain values."""

@@ -27,7 +27,7 @@ from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import MapperParams
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel, load_network
-from jaxmap.models.deeplab import Weights, fold_batch_norm
+from jaxmap.models.network import Weights, fold_batch_norm
 from jaxmap.runs.config import observations_in
 from jaxmap.runs.evaluation import class_layer_of
 from jaxmap.runs.labelling import Notify

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ from jaxmap.geometry.bounds import map_bytes, view_boxes
 from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.attributes import MapAttributes
-from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, run_sequence
+from jaxmap.mapping.devices import Device, choose_devices, run_on_devices
+from jaxmap.mapping.sequence import FusedFrame, PreparedFrame
 from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import MovingBlock, TileStore
 from jaxmap.planning.ground import map_layers
@@ -57,6 +58,7 @@ def run_plan(
     watch: Watch = unwatched,
     profile: bool = False,
     report: bool = True,
+    devices: Sequence[Device] | None = None,
 ) -> dict[str, Any]:
     """Maps the sequence and writes all outputs.
 
@@ -73,6 +75,7 @@ def run_plan(
         watch: looks at the map after each frame (`viewing.live_view`).
         profile: record a trace of some steps into the folder, and report where their time went.
         report: write the page of the run.
+        devices: of `mapping.devices.choose_devices`, by default its default.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -80,22 +83,19 @@ def run_plan(
     Raises:
         JaxmapError: no frame could be fused, or an output cannot be written.
     """
+    devices = devices or choose_devices(None, plan.members)
     memory = _TiledMap(plan, folder.map) if plan.block_shape else _WholeMap(plan, folder.map)
     voxel_map, log = memory.begin()
-    if log.complete:
-        notify("the run is complete already; its outputs are written anew")
-    elif log.next_index:
-        notify(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
+    _tell_progress(plan, log, notify)
     step_profile, program = StepProfile(folder.profile if profile else None), None
     saved_s = resumed_s = time.perf_counter()
     if plan.keeper is not None:
         plan.keeper.begin(folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
-    frames = plan.prepare(log.next_index, keep_in=folder.observations)
-    run = run_sequence(
-        plan.mapper, voxel_map, frames, plan.params, plan.key, strict=strict, form=form, cover=memory.cover
-    )
-    pictures = _Pictures(plan, folder)
+    frames = plan.prepare(range(log.next_index, len(plan.sequence.frames)), keep_in=folder.observations)
+    options: dict[str, Any] = {"strict": strict, "form": form, "cover": memory.cover}
+    run = run_on_devices(plan.mapper, voxel_map, frames, plan.params, plan.key, devices, **options)
+    pictures = Pictures(plan, folder)
     try:
         for voxel_map, fused in run:
             if fused.cost is not None:
@@ -104,14 +104,15 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
-            pictures.note(fused, voxel_map)
+            pictures.note(fused, log.fused)
             log.add(fused, _disparity_scores(plan, fused))
             resumed_s += pictures.write_many()
             if fused.info is not None:
                 step_profile.step_done()
             on_frame(fused)
             watch(fused, voxel_map)
-            if time.perf_counter() - saved_s > checkpoint_every_s:
+            # A map that several devices have made holds all of a batch, whose frames are counted one by one.
+            if int(voxel_map.frames_fused) == log.fused and time.perf_counter() - saved_s > checkpoint_every_s:
                 log.total_s += time.perf_counter() - resumed_s
                 _save(plan, log, memory, voxel_map, pictures)
                 saved_s = resumed_s = time.perf_counter()
@@ -129,13 +130,20 @@ def run_plan(
         raise JaxmapError(f"none of {len(log.skipped)} frames could be fused; the first: {log.skipped[0]['reason']}")
 
     log.complete = True
-    reader = memory.save(voxel_map, _attributes(plan, log, voxel_map))
-    metrics = _write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
+    reader = memory.finish(voxel_map, map_attributes(plan, log, voxel_map))
+    metrics = write_outputs(plan, folder, log, reader, _profile(step_profile, program, notify) if profile else {})
     if report:
         write_report(folder.path)
-    for note in _notes(plan, log, metrics):
+    for note in notes(plan, log, metrics):
         notify(f"note: {note}")
     return metrics
+
+
+def _tell_progress(plan: Plan, log: RunLog, notify: Notify) -> None:
+    if log.complete:
+        notify("the run is complete already; its outputs are written anew")
+    elif log.next_index:
+        notify(f"going on after {log.next_index} of {len(plan.sequence.frames)} frames")
 
 
 class _WholeMap:
@@ -153,13 +161,17 @@ class _WholeMap:
         _check_same(self.plan, voxel_map, log, self.path)
         return voxel_map, log
 
-    def cover(self, voxel_map: VoxelMap, index: int) -> VoxelMap:
+    def cover(self, voxel_map: VoxelMap, indices: Sequence[int]) -> VoxelMap:
         """It holds the view of any frame."""
         return voxel_map
 
-    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> None:
         """Writes the map."""
         save_map(self.path, voxel_map, attributes)
+
+    def finish(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """Writes the map for good, and opens it."""
+        self.save(voxel_map, attributes)
         return in_memory(voxel_map, attributes)
 
 
@@ -181,23 +193,26 @@ class _TiledMap:
         _check_same(self.plan, replace(voxel_map, grid=stored.grid), log, self.path)
         return voxel_map, log
 
-    def cover(self, voxel_map: VoxelMap, index: int) -> VoxelMap:
-        """The block, where it holds the view of a frame."""
-        return self.block.cover(voxel_map, self.boxes[index])
+    def cover(self, voxel_map: VoxelMap, indices: Sequence[int]) -> VoxelMap:
+        """The block, where it holds the views of frames."""
+        return self.block.cover(voxel_map, self.boxes[list(indices)])
 
-    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+    def save(self, voxel_map: VoxelMap, attributes: MapAttributes) -> None:
         """Writes the tiles that have changed, and the attributes, all at once."""
         self.block.write_changes(voxel_map)
         self.block.store.commit(int(voxel_map.frames_fused), attributes)
-        if attributes.progress.get("complete"):
-            self.block.store.close()
+
+    def finish(self, voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
+        """Writes the map for good, and opens it, which lists its tiles: seconds where they are many."""
+        self.save(voxel_map, attributes)
+        self.block.store.close()
         return open_map(self.path)
 
 
-def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: _Pictures) -> None:
+def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: Pictures) -> None:
     """Saves a map on the way; the pictures of its frames first, so that what counts as done has them."""
     pictures.write()
-    memory.save(voxel_map, _attributes(plan, log, voxel_map))
+    memory.save(voxel_map, map_attributes(plan, log, voxel_map))
 
 
 def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
@@ -222,7 +237,7 @@ def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
     return score_disparity(rectified.disparity_px, truth_px)
 
 
-def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
+def notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
     """What the user should look at."""
     said = {finding.kind for finding in plan.findings}
     if log.too_near and not said & {"near-limit", "vertical-disparity"}:
@@ -250,7 +265,7 @@ def _notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"no voxel is occupied: {reason}"
 
 
-def _write_outputs(
+def write_outputs(
     plan: Plan, folder: RunFolder, log: RunLog, reader: MapReader, details: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes all that a run leaves beside its map, and returns its metrics, the details among them."""
@@ -306,11 +321,12 @@ def _check_same(plan: Plan, voxel_map: VoxelMap, log: RunLog, where: Path) -> No
         )
 
 
-def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
+def map_attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap | None = None) -> MapAttributes:
+    """What is stored beside the map, which is looked at where it has an ensemble."""
     log.digest = plan.digest(log.next_index)
-    layers = named_layers(voxel_map, plan.params.fusion, plan.rule)
+    layers = {} if voxel_map is None else named_layers(voxel_map, plan.params.fusion, plan.rule)
     # Of a part of a larger map, the layers would be no map's.
-    if log.complete and plan.block_shape is None:
+    if log.complete and plan.block_shape is None and voxel_map is not None:
         layers |= map_layers(voxel_map, plan.params.fusion)
     return MapAttributes(
         crs=plan.sequence.crs,
@@ -322,17 +338,17 @@ def _attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap) -> MapAttributes:
     )
 
 
-class _Pictures:
+class Pictures:
     """Key frames that wait for their pictures to be written."""
 
     def __init__(self, plan: Plan, folder: RunFolder) -> None:
         self.plan, self.folder = plan, folder
         self.waiting: list[tuple[PreparedFrame, int]] = []
 
-    def note(self, fused: FusedFrame, voxel_map: VoxelMap) -> None:
-        """Keeps a key frame; to be called before the frame counts, so that an interrupt loses none."""
+    def note(self, fused: FusedFrame, number: int) -> None:
+        """Keeps a key frame, before which so many were fused; before it counts, so that an interrupt loses none."""
         if fused.info is not None and fused.prepared.index in self.plan.key_frames:
-            self.waiting.append((fused.prepared, int(voxel_map.frames_fused) - 1))
+            self.waiting.append((fused.prepared, number))
 
     def write_many(self) -> float:
         """Writes pictures where many wait, and returns how long that took, in seconds."""

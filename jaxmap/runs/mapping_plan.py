@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -18,10 +18,12 @@ from jaxmap.ensemble.draws import draw_ensemble
 from jaxmap.errors import UsageError
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import fusion_attribute, make_fusion_params
-from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, site_lattice, usable_depth
+from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, site_lattice, usable_depth, view_boxes
 from jaxmap.geometry.grid import window_shape
 from jaxmap.geometry.options import GridOptions, Triple
+from jaxmap.labellers.base import Labeller
 from jaxmap.mapping.observations import Observations
+from jaxmap.mapping.regions import frames_of_tiles, region_shape
 from jaxmap.mapping.sequence import PreparedFrame, frame_form, observed_frames, prepare_frames
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.mapping.tiles import block_shape, whole_tiles
@@ -88,17 +90,25 @@ def describe_grid(
     class_count: int,
     members: int,
     block: tuple[int, int, int] | None = None,
+    held: str = "around the rover in memory",
 ) -> str:
     """One line on what is mapped, and the memory it takes."""
     taken = f"{map_bytes(grid if block is None else replace(grid, shape=block), class_count, members) / 2**20:.0f} MiB"
     if block is not None:
-        taken = f"in tiles on disk, {' x '.join(map(str, block))} voxels around the rover in memory, {taken}"
+        taken = f"in tiles on disk, {' x '.join(map(str, block))} voxels {held}, {taken}"
     size = " x ".join(f"{edge:g}" for edge in np.asarray(grid.voxel_size_m, np.float64).round(6))
     return (
         f"depth {depth_range_m[0]:g} to {depth_range_m[1]:g} m; grid {' x '.join(map(str, grid.shape))} voxels of "
         f"{size} m, {1 + class_count} channels{f' and {members} members of 2' if members else ''}: "
         f"{taken}"
     )
+
+
+class Sharing(NamedTuple):
+    """How a map is shared out: how many workers there are, and the memory that a region may take on each."""
+
+    workers: int
+    memory_gib: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +118,8 @@ class Plan(Perception):
     Attributes:
         keeper: keeps what is perceived on the way, where that was asked for.
         pose_errors: of the members of an ensemble, for each frame.
+        block_shape: of a map that is larger than the memory it may take, or shared out: voxels along each axis of the
+            part that is in memory.
     """
 
     grid: GridSpec
@@ -119,9 +131,7 @@ class Plan(Perception):
     key: PRNGKeyArray
     keeper: Keeper | None = None
     pose_errors: Float[np.ndarray, "N M 6"] | None = None
-    """Of the members of an ensemble, for each frame."""
     block_shape: tuple[int, int, int] | None = None
-    """Of a map that is larger than the memory it may take: voxels along each axis of the part that is in memory."""
 
     @property
     def members(self) -> int:
@@ -135,25 +145,26 @@ class Plan(Perception):
         shape = () if kept is None else kept.attributes.kept_shape
         return frame_form(self.front_end.camera, self.labeller, self.members, shape)
 
-    def prepare(self, first: int = 0, keep_in: Path | None = None) -> Iterator[PreparedFrame]:
-        """The frames from one on, made ready ahead of their use.
+    def prepare(self, indices: Sequence[int] | None = None, keep_in: Path | None = None) -> Iterator[PreparedFrame]:
+        """Frames, made ready ahead of their use.
 
         Args:
-            first: index of the first.
+            indices: which; by default all.
             keep_in: the observations to be written on the way, with a keeper.
         """
+        indices = range(len(self.sequence.frames)) if indices is None else indices
         if self.observations is not None:
             more: Any = {"left_image": self.left_image, "pose_errors": self.pose_errors}
-            return observed_frames(self.observations, first=first, **more)
+            return observed_frames(self.observations, indices=indices, **more)
         if self.keeper is not None and keep_in is not None:
-            return self.keeper.frames(keep_in, range(first, len(self.sequence.frames)), self.pose_errors)
+            return self.keeper.frames(keep_in, indices, self.pose_errors)
         return prepare_frames(
             self.sequence,
             self.front_end,
             self.label_folder,
             needs=self.labeller.needs,
             pose_errors=self.pose_errors,
-            indices=range(first, len(self.sequence.frames)),
+            indices=indices,
         )
 
     def settings(self, config: PerceiveConfig) -> dict[str, Any]:
@@ -180,6 +191,7 @@ def plan_run(
     keep: bool = False,
     images: bool = False,
     in_tiles: bool = False,
+    shared: Sharing | tuple[int, int, int] | None = None,
 ) -> Plan:
     """Opens the sequence or its observations, and decides range, bounds, labeller and step.
 
@@ -191,6 +203,7 @@ def plan_run(
         keep: keep what is perceived, as observations.
         images: of observations, too, let the labeller see the images (`plan_perception`).
         in_tiles: a map that takes more memory than it may is kept in tiles, not refused.
+        shared: fuse regions of the map apart, one at a time on each worker; or the shape of a region.
 
     Raises:
         JaxmapError: the data or the settings do not serve.
@@ -213,8 +226,12 @@ def plan_run(
     T_known = None if members else sequence.T_world_camera @ front_end.T_raw_rectified
     window = window_shape(grid, camera, depth_range_m[1], T_known)
     tiled = in_tiles and not members
-    grid, block = _fit_memory(grid, window, len(labeller.classes), members, config.grid.max_memory_gib, tiled=tiled)
-    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block))
+    if shared is not None:
+        grid, block = _in_regions(grid, camera, labeller, depth_range_m[1], T_known, shared)
+    else:
+        grid, block = _fit_memory(grid, window, len(labeller.classes), members, config.grid.max_memory_gib, tiled=tiled)
+    held = ("fused at a time",) if shared else ()
+    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block, *held))
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
     if members:
@@ -259,6 +276,36 @@ def _fit_memory(
             return whole_tiles(grid), block
     check_memory(grid, class_count, limit_gib, members)
     return grid, None
+
+
+def _in_regions(
+    grid: GridSpec,
+    camera: StereoCamera,
+    labeller: Labeller,
+    max_depth_m: float,
+    T_known: Float[np.ndarray, "N 4 4"] | None,
+    shared: Sharing | tuple[int, int, int],
+) -> tuple[GridSpec, tuple[int, int, int]]:
+    """The grid in whole tiles, and voxels along each axis of the regions that workers fuse.
+
+    Raises:
+        UsageError: there is an ensemble, or not even the smallest region fits.
+    """
+    if T_known is None:
+        raise UsageError("an ensemble is fused in one piece", where="ensemble.members", fix="leave the workers out")
+    grid = whole_tiles(grid)
+    if not isinstance(shared, Sharing):
+        return grid, shared
+    touching = frames_of_tiles(grid, view_boxes(grid, camera, T_known, max_depth_m))
+    window, limit_bytes = window_shape(grid, camera, max_depth_m, T_known), shared.memory_gib * 2**30
+    shape = region_shape(grid, window, 1 + len(labeller.classes), limit_bytes, touching, shared.workers)
+    if shape is None:
+        raise UsageError(
+            f"what one frame sees takes more than the {shared.memory_gib:.3g} GiB that each worker may",
+            where="grid.max_memory_gib",
+            fix="take fewer workers, larger voxels (--grid.voxel-size-m), or raise --grid.max-memory-gib",
+        )
+    return grid, shape
 
 
 def _note_other_noise(observations: Observations, config: MapConfig, notify: Notify) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -245,7 +245,7 @@ def resolved_settings(seen: Perception, config: PerceiveConfig) -> dict[str, Any
 
 def outputs_of(folder: RunFolder) -> Iterable[Path]:
     """What a perception writes into its folder."""
-    return (folder.observations, folder.config, folder.metrics, *folder.pictures.glob("[0-9]*_*.png"))
+    return (folder.observations, folder.config, folder.metrics, *folder.pictures.glob("[0-9]*_*.*"))
 
 
 @contextmanager
@@ -283,13 +283,35 @@ class _Log:
     skipped: dict[str, str] = field(default_factory=dict)
     stages_ms: dict[str, Sample] = field(default_factory=dict)
 
-    def add(self, prepared: PreparedFrame) -> None:
-        if prepared.frame is None:
-            self.skipped[prepared.ref.name] = str(prepared.fault)
+    def add(self, kept: KeptFrame) -> None:
+        if kept.fault is not None:
+            self.skipped[kept.name] = str(kept.fault)
             return
         self.perceived += 1
-        for name, seconds in prepared.stages_s.items():
+        for name, seconds in kept.stages_s.items():
             self.stages_ms.setdefault(name, Sample()).add(round(1e3 * seconds, 3))
+
+
+class KeptFrame(NamedTuple):
+    """What became of a frame: it is kept, or there is a fault."""
+
+    name: str
+    fault: FrameError | None
+    stages_s: dict[str, float]
+
+
+def keep_frames(keeper: Keeper, folder: RunFolder, indices: Sequence[int]) -> Iterator[KeptFrame]:
+    """Perceives frames and keeps them, and the pictures of the key frames.
+
+    Raises:
+        JaxmapError: the first readable pair has left and right swapped, or the disk is full.
+    """
+    for prepared in keeper.frames(folder.observations, indices):
+        if prepared.frame is not None and prepared.index in keeper.seen.key_frames:
+            assert prepared.rectified is not None
+            # At full size: maps draw their own pictures, of any size, from these.
+            write_key_frame(folder, prepared.index, prepared.rectified, None, (), large=True)
+        yield KeptFrame(prepared.ref.name, prepared.fault, prepared.stages_s)
 
 
 def run_perception(
@@ -298,7 +320,8 @@ def run_perception(
     *,
     strict: bool,
     notify: Notify,
-    on_frame: Callable[[int], None] = lambda done: None,
+    on_frame: Callable[[int], object] = lambda done: None,
+    keep: Callable[[Sequence[int]], Iterable[KeptFrame]] | None = None,
 ) -> dict[str, Any]:
     """Perceives the frames that are not there yet, and keeps each as soon as it is seen.
 
@@ -308,6 +331,7 @@ def run_perception(
         strict: stop at the first frame that cannot be used.
         notify: takes lines for the user.
         on_frame: is told after each frame how many are done.
+        keep: perceives frames and keeps them, in whatever order; `keep_frames` by default.
 
     Returns:
         The metrics, as they are in metrics.json.
@@ -315,21 +339,17 @@ def run_perception(
     Raises:
         JaxmapError: no frame could be perceived, or one cannot be written.
     """
-    refs, seen, log = keeper.seen.sequence.frames, keeper.seen, _Log()
+    refs, log = keeper.seen.sequence.frames, _Log()
     keeper.begin(folder.observations)
     missing = [index for index, ref in enumerate(refs) if not is_observed(folder.observations, ref.name)]
     there = len(refs) - len(missing)
     if there:
         notify(f"{there} of {len(refs)} frames are there already" + ("" if missing else ": nothing is left to do"))
     started_s = time.perf_counter()
-    for prepared in keeper.frames(folder.observations, missing):
-        if strict and prepared.fault is not None:
-            raise prepared.fault
-        if prepared.frame is not None and prepared.index in seen.key_frames:
-            assert prepared.rectified is not None
-            # At full size: maps draw their own pictures, of any size, from these.
-            write_key_frame(folder, prepared.index, prepared.rectified, None, (), large=True)
-        log.add(prepared)
+    for kept in keep_frames(keeper, folder, missing) if keep is None else keep(missing):
+        if strict and kept.fault is not None:
+            raise kept.fault
+        log.add(kept)
         on_frame(there + log.perceived + len(log.skipped))
     if not there + log.perceived:
         reason = next(iter(log.skipped.values()))

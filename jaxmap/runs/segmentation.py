@@ -20,8 +20,9 @@ from jaxmap.evaluation.segmentation_scores import SegmentationScores, check_mask
 from jaxmap.host.files import atomic_path
 from jaxmap.host.memory import available_bytes
 from jaxmap.labels import ANY_OTHER, IGNORE
+from jaxmap.models.base import Images
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import Images, Weights, inference_network
+from jaxmap.models.network import Weights, inference_network
 from jaxmap.models.pixelwise import check_size, resized_input, resized_output
 from jaxmap.report.pictures import overlay_labels
 from jaxmap.runs.large_pictures import LARGE_PX, OVERVIEW_PX, Size, enlarged, read_decimated

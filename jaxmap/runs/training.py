@@ -21,7 +21,7 @@ from jaxmap.host.files import atomic_path, real_path
 from jaxmap.host.output_folder import check_inputs_stay, check_same_settings, write_json, write_yaml
 from jaxmap.host.replacement import Replacement
 from jaxmap.models.checkpoint import save_model
-from jaxmap.models.deeplab import Weights
+from jaxmap.models.network import Weights
 from jaxmap.report.training_page import TrainingRecord, training_page
 from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainingPlan
 from jaxmap.training.checkpoints import Checkpoints
@@ -204,7 +204,7 @@ class TrainingFolder:
         facts = {
             **plan.data.facts(),
             "Examples": f"{plan.order.examples} fixed ones" if fixed else "drawn anew in each epoch",
-            "Network": f"DeepLabv3{'+' * record.decoder}, {record.backbone}, output stride {record.output_stride}"
+            "Network": f"{record.name}, {record.backbone}, output stride {record.output_stride}"
             + ", sees relief" * bool(record.relief_channels),
             "Initial weights": "random" if plan.init is None else plan.init.name,
             "Random parts": ", ".join(network.fresh) or "none",

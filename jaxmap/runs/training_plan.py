@@ -17,7 +17,7 @@ from jaxmap.host.files import real_path
 from jaxmap.host.settings import CellSize, NotNegative, Positive, Settings, options
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import load_model
-from jaxmap.models.deeplab import Weights
+from jaxmap.models.network import Weights
 from jaxmap.runs.config import LabellerName, MapConfig
 from jaxmap.training.batches import ExampleOrder, ExampleReader, batches_from
 from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set, with_stereo
@@ -276,7 +276,7 @@ def describe_network(network: InitialNetwork) -> str:
     """One line on the network and its initial weights."""
     record, parameters = network.architecture, sum(jnp.size(weight) for weight in network.weights.values())
     return (
-        f"DeepLabv3{'+' * record.decoder} on {record.backbone}{' and relief' * bool(record.relief_channels)}, "
+        f"{record.name} on {record.backbone}{' and relief' * bool(record.relief_channels)}, "
         f"{parameters / 1e6:.1f} million parameters, "
         f"output stride {record.output_stride}; fresh: {', '.join(network.fresh) or 'nothing'}; "
         f"batch norm learns in: {', '.join(network.batch_norms) or 'nothing'}"

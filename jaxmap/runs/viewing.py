@@ -24,6 +24,7 @@ from jaxmap.types import VoxelMap, pinhole
 
 MOST_PARTS = 240
 """Frames after which voxels appear; more would make a viewer slow."""
+_NEAR_M = 1e-3
 _EVERY_S = 2.0
 """How often the map is shown while it grows."""
 
@@ -57,10 +58,10 @@ def _log_pictures(log: Recording, contents: RunContents, frames: RunFrames) -> I
     """Logs the pictures of the key frames, and tells how many."""
     shown = 0
     for name, pictures in contents.pictures.items():
-        row = int(np.searchsorted(frames.index, int(name)))
-        if row == len(frames.index) or frames.index[row] != int(name):
+        row = _row_of(name, contents, frames)
+        if row is None:
             continue
-        log.at(int(name), float(frames.timestamps_s[row]))
+        log.at(int(frames.index[row]), float(frames.timestamps_s[row]))
         try:
             for kind, path in pictures.items():
                 if kind == "left":
@@ -74,6 +75,17 @@ def _log_pictures(log: Recording, contents: RunContents, frames: RunFrames) -> I
     kinds = ", ".join(kind for kind in PICTURES if any(kind in pictures for pictures in contents.pictures.values()))
     yield f"{len(frames.index)} poses; pictures ({kinds or 'none'}) of {shown} key frames"
     yield from frames.notes
+
+
+def _row_of(name: str, contents: RunContents, frames: RunFrames) -> int | None:
+    """Which of the frames a key frame is: by its number, or where the run's table is lost, by where it was taken."""
+    known = contents.group("camera").get("key_frames")
+    if not frames.names and isinstance(known, dict) and name in known:
+        place = np.array(known[name], np.float64).reshape(4, 4)[:3, 3] - frames.T_world_camera[:, :3, 3]
+        off_m = np.linalg.norm(place, axis=1)
+        return int(off_m.argmin()) if off_m.min() < _NEAR_M else None
+    rows = np.flatnonzero(frames.index == int(name))
+    return int(rows[0]) if len(rows) else None
 
 
 def _log_voxels(log: Recording, contents: RunContents, frames: RunFrames) -> Iterator[str]:
@@ -123,7 +135,9 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
             if prepared.rectified is not None and prepared.frame is not None:
                 left = prepared.rectified.left
                 log.pose(T_world_camera[prepared.index])
-                log.left(left, pinhole(camera), camera.width_px)
+                # Observations have that of key frames alone.
+                if left.size:
+                    log.left(left, pinhole(camera), camera.width_px)
                 log.picture("disparity", colourise_disparity(prepared.rectified.disparity_px))
                 if classes and prepared.index in plan.key_frames:
                     number = int(voxel_map.frames_fused) - 1

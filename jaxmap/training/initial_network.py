@@ -13,7 +13,7 @@ from jaxmap.errors import UsageError
 from jaxmap.geometry.relief import RELIEF_CHANNELS
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import Weights, initial_weights
+from jaxmap.models.network import Weights, initial_weights
 from jaxmap.models.tensor_files import shortened
 from jaxmap.training.options import BatchNormOptions, NetworkOptions
 
@@ -28,6 +28,14 @@ _CHOICES = (
     *("top_conv", "dropout"),
 )
 """Fields that `NetworkOptions` may set."""
+
+_OF_DEEPLAB = ("family", "atrous_rates", "decoder_convs", "low_level_channels", "relief")
+_FOREIGN = {
+    "fcn": _OF_DEEPLAB,
+    "unet": (*_OF_DEEPLAB, "decoder", "dropout"),
+    "segnet": (*_OF_DEEPLAB, "decoder", "dropout", "head_channels"),
+}
+"""Options that mean nothing to a kind of network."""
 
 
 class InitialNetwork(NamedTuple):
@@ -58,7 +66,7 @@ def make_initial_network(
     """Chooses the architecture and the initial weights.
 
     Weights of `init` are loaded where the network has an array of the same name and shape; those of the classifier
-    only if the classes agree as well.
+    only if the classes agree as well, and of another kind of network only those of the backbone.
 
     Args:
         options: of the network.
@@ -69,7 +77,7 @@ def make_initial_network(
         where: the file of `init`, for errors.
 
     Raises:
-        UsageError: the options ask for another backbone than the file has.
+        UsageError: the options ask for another backbone than the file has, or mean nothing to this kind of network.
         JaxmapError: no such network can be built.
     """
     architecture = _architecture(options, tuple(classes), init, where)
@@ -77,12 +85,14 @@ def make_initial_network(
     kept: set[str] = set()
     if init is not None:
         same_classes = init.holds == "network" and init.architecture.classes == architecture.classes
+        same_kind = init.architecture.kind == architecture.kind
         kept = {
             name
             for name, value in init.weights.items()
             if name in weights
             and weights[name].shape == value.shape
             and (same_classes or not name.startswith("classifier."))
+            and (same_kind or name.startswith("backbone."))
         }
         unused = [name for name in init.weights if name.startswith("backbone.") and name not in kept]
         lost = sorted({".".join(name.split(".")[:2]) for name in unused})
@@ -92,9 +102,10 @@ def make_initial_network(
         weights.update({name: init.weights[name] for name in kept})
     fresh = tuple(sorted({name.split(".")[0] for name in weights if name not in kept}))
     # Batch norms that were trained before keep their statistics by default: few images would spoil them.
+    with_norms = {name.split(".")[0] for name in weights if ".norm." in name}
     trained = [
         part
-        for choice, parts in ((norm.backbone, ("backbone",)), (norm.head, ("aspp", "decoder")))
+        for choice, parts in ((norm.backbone, ("backbone",)), (norm.head, tuple(sorted(with_norms - {"backbone"}))))
         for part in parts
         if choice == "batch" or (choice == "auto" and set(parts) & set(fresh))
     ]
@@ -107,6 +118,10 @@ def _architecture(
     chosen = {name: value for name in _CHOICES if (value := getattr(options, name)) is not None}
     if options.relief is not None:
         chosen["relief_channels"] = RELIEF_CHANNELS if options.relief else 0
+    kind = options.kind or ("deeplab" if init is None else init.architecture.kind)
+    if foreign := [name for name in _FOREIGN.get(kind, ()) if getattr(options, name) is not None]:
+        name = foreign[0].replace("_", "-")
+        raise UsageError(f"network.{name} is given, which means nothing to {kind}", where="network", fix="leave it out")
     if init is None:
         return replace(_of_family(options, classes), **chosen)
     trained = init.architecture
@@ -114,16 +129,19 @@ def _architecture(
         raise UsageError(
             f"the file holds {trained.backbone}, not {options.backbone}", where=where, fix="leave out network.backbone"
         )
-    if init.holds == "network" and options.family is None:
+    if init.holds == "network" and options.family is None and kind == trained.kind:
         return replace(trained, classes=classes, **chosen)
     family = options.family or ("tf" if trained.size_remainder else "torch")
-    stride = options.output_stride or trained.output_stride
-    asked = replace(options, backbone=trained.backbone, family=family, output_stride=stride)
-    kept = {name: getattr(trained, name) for name in _BACKBONE_FIELDS}
+    stride = options.output_stride or (trained.output_stride if kind == trained.kind else None)
+    asked = replace(options, kind=kind, backbone=trained.backbone, family=family, output_stride=stride)
+    kept = {name: getattr(trained, name) for name in _BACKBONE_FIELDS if kind == "deeplab" or name != "size_remainder"}
     return replace(_of_family(asked, classes), **{**kept, **chosen})
 
 
 def _of_family(options: NetworkOptions, classes: tuple[str, ...]) -> Architecture:
+    if options.kind not in (None, "deeplab"):
+        # Another stride may go only with another choice, of the decoder: both are set at once, by the caller.
+        return torch_architecture(options.backbone or "mobilenet_v2", classes, kind=options.kind)
     stride = options.output_stride or 16
     make = tf_architecture if options.family == "tf" else torch_architecture
     record = make(options.backbone or "mobilenet_v2", classes, output_stride=stride)

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator
 from jaxmap.datasets.options import Bits
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import NotNegative, Positive, Seed, count, options
-from jaxmap.models.architecture import Backbone
+from jaxmap.models.architecture import Backbone, Kind
 
 Weight = Annotated[float, Positive]
 WeightOrNone = Annotated[float, NotNegative]
@@ -138,7 +138,7 @@ class BatchNormOptions:
     backbone: Literal["auto", "batch", "frozen"] = "auto"
     """Of the backbone; auto: frozen where it was trained before."""
     head: Literal["auto", "batch", "frozen"] = "auto"
-    """Of ASPP and decoder; auto: frozen where they were trained before."""
+    """Of all else (ASPP, decoder); auto: frozen where they were trained before."""
 
 
 @options()
@@ -165,18 +165,21 @@ class TrainingOptions:
 class NetworkOptions:
     """The network; what is not set is as in the file that training starts from, or the default of the family."""
 
+    kind: Kind | None = None
+    """What labels by the features: DeepLab, FCN, SegNet or U-Net; deeplab unless --init says otherwise."""
     backbone: Backbone | None = None
     """What computes the features; mobilenet_v2 unless --init says otherwise."""
     family: Literal["torch", "tf"] | None = None
-    """Details of the head: those of torch implementations, or of the original in TensorFlow."""
-    output_stride: Literal[16, 8] | None = None
-    """Input pixels for each feature."""
+    """Details of DeepLab's head: those of torch implementations, or of the original in TensorFlow."""
+    output_stride: Literal[32, 16, 8] | None = None
+    """Input pixels for each of the coarsest features: 16 or 8 of DeepLab, 32 of the others."""
     head_channels: Annotated[int, Interval(ge=1, le=4096)] | None = None
-    """Channels of ASPP and decoder."""
+    """Channels of ASPP and decoder, or of FCN's convolution; those of U-Net's first step, halved at each
+    further one."""
     atrous_rates: tuple[Annotated[int, Interval(ge=1, le=1024)], ...] | None = None
     """Dilations of the ASPP branches."""
     decoder: bool | None = None
-    """Whether a low-level feature joins before the logits: DeepLabv3+, or DeepLabv3."""
+    """Whether finer features join before the logits: DeepLabv3+ and FCN-8s, or DeepLabv3 and plain FCN."""
     decoder_convs: Annotated[int, Interval(ge=1, le=8)] | None = None
     """Separable convolutions of the decoder."""
     low_level_channels: Annotated[int, Interval(ge=1, le=4096)] | None = None
@@ -186,4 +189,4 @@ class NetworkOptions:
     top_conv: bool | None = None
     """Whether MobileNetV2 or EfficientNet-Lite0 keeps its last convolution, to 1280 channels."""
     dropout: Share | None = None
-    """Share of ASPP features dropped while training."""
+    """Share of the features before the logits dropped while training."""

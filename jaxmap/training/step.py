@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Float16, Int, PRNGKeyArray,
 
 from jaxmap.labels import IGNORE
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.deeplab import Weights, training_form
+from jaxmap.models.network import Weights, training_form
 from jaxmap.training.augment import Crop, augment
 from jaxmap.training.losses import correct, total_loss
 from jaxmap.training.options import OptimiserOptions, TrainingOptions

@@ -14,7 +14,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.evaluation.segmentation_scores import SegmentationScores
 from jaxmap.labels import ANY_OTHER, IGNORE
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.deeplab import Weights, fold_batch_norm, pure_network
+from jaxmap.models.network import Weights, fold_batch_norm, pure_network
 from jaxmap.training.data import Example, read_example
 from jaxmap.training.relief import read_relief
 

@@ -25,7 +25,7 @@ from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.models.architecture import Architecture
-from jaxmap.models.deeplab import Weights, training_form
+from jaxmap.models.network import Weights, training_form
 from jaxmap.models.resizing import resize_bilinear
 from jaxmap.training.options import TrainingOptions
 from jaxmap.training.step import StepMetrics, TrainState, make_updater, parted

@@ -43,7 +43,7 @@ from jaxmap.mapping.sequence import prepare_frames, run_sequence
 from jaxmap.mapping.step import Mapper, MapperParams, compile_step, make_mapper
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import Weights, inference_network, initial_weights, training_form
+from jaxmap.models.network import Weights, inference_network, initial_weights, training_form
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
 from jaxmap.training.losses import total_loss

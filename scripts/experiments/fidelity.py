@@ -19,8 +19,8 @@ import numpy as np
 from common import Table, command_line, parse
 
 from jaxmap.models.architecture import IMAGENET_MEAN, IMAGENET_STD
-from jaxmap.models.deeplab import inference_network
 from jaxmap.models.importers import import_weights
+from jaxmap.models.network import inference_network
 
 
 def random_network(backbone: str, stride: int) -> Any:

@@ -25,7 +25,7 @@ from jaxmap.host.files import bundled
 from jaxmap.labellers.options import ReliefOptions
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.models.checkpoint import load_network
-from jaxmap.models.deeplab import inference_network
+from jaxmap.models.network import inference_network
 from jaxmap.runs.config import MapConfig
 from jaxmap.runs.mapping_plan import plan_run
 

@@ -70,10 +70,21 @@ def newer(given: Given) -> Path:
     return run
 
 
+def copied(given: Given) -> Path:
+    return Path(shutil.copytree(given.run, given.folder / "copy"))
+
+
 def without_metrics(given: Given) -> Path:
     run = Path(shutil.copytree(given.run, given.folder / "no_metrics"))
     (run / "metrics.json").unlink()
     return run
+
+
+def damaged_observations(given: Given) -> Path:
+    folder = given.folder / "observations.zarr"
+    folder.mkdir()
+    (folder / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {}}')
+    return folder
 
 
 def below_a_file(given: Given) -> Path:
@@ -91,6 +102,8 @@ ENDS = ("--start", 0, 0, "--goal", 1, 1)
 FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "unknown command": (2, lambda given: ["mapp"]),
     "check: no sequence": (1, lambda given: ["check", given.folder / "nowhere"]),
+    "perceive: no sequence": (1, lambda given: ["perceive", given.folder / "nowhere", "--out", given.folder / "run"]),
+    "map: damaged observations": (1, lambda given: ["map", damaged_observations(given), "--out", given.folder / "run"]),
     "map: pose with a word": (1, lambda given: mapped(given, damage=worded_pose)),
     "map: truncated image, strictly": (1, lambda given: mapped(given, "--strict", damage=truncated)),
     "map: all frames unreadable": (1, lambda given: mapped(given, damage=all_unreadable)),
@@ -101,6 +114,8 @@ FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "evaluate: no run": (1, lambda given: ["evaluate", given.folder / "nowhere", given.folder / "truth.tif"]),
     "plan: no run": (1, lambda given: ["plan", given.folder / "nowhere", *ENDS]),
     "plan: unknown rover": (2, lambda given: ["plan", given.run, *ENDS, "--rover", "sparrow"]),
+    "explain: outside the map": (2, lambda given: ["explain", copied(given), "--at", "-900", "0"]),
+    "merge: one run": (2, lambda given: ["merge", given.run, "--out", given.folder / "run"]),
     "export: newer map": (1, lambda given: ["export", newer(given)]),
     "report: no metrics": (1, lambda given: ["report", without_metrics(given)]),
     "demo: out lies in a file": (1, lambda given: ["demo", "--out", below_a_file(given)]),
@@ -219,7 +234,7 @@ def test_a_faulty_input_leaves_the_run_that_is_there(cli, scene_copy, finished_r
     ],
 )
 def test_a_fault_of_our_own_and_an_interrupt_are_one_line_too(raised, status, line, cli, scene_folder, monkeypatch):
-    def broken(*_: object) -> None:
+    def broken(*_: object, **options: object) -> None:
         raise raised
 
     monkeypatch.setattr("jaxmap.runs.mapping_plan.plan_run", broken)

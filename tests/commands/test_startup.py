@@ -20,7 +20,7 @@ from planned_runs import planned
 import jaxmap
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.mapping.sequence import frame_form, prepare_frames
-from jaxmap.models.deeplab import fold_batch_norm, initial_weights
+from jaxmap.models.network import fold_batch_norm, initial_weights
 from jaxmap.types import make_grid, make_stereo_camera, to_device
 
 COUNTING = """

@@ -65,7 +65,7 @@ def seeded_weights(architecture) -> dict[str, np.ndarray]:
 
 @lru_cache(maxsize=3)
 def _seeded_weights(architecture) -> dict[str, np.ndarray]:
-    from jaxmap.models.deeplab import weight_shapes
+    from jaxmap.models.network import weight_shapes
 
     def tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
         if len(shape) == 4:

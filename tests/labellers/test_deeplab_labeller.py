@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from golden.seeded_weights import seeded_image
+from golden.seeded_weights import seeded_image, seeded_weights
 from hypothesis import given
 from hypothesis import strategies as st
 from networks import NETWORK_CLASSES, small_model
@@ -24,6 +24,8 @@ from jaxmap.labellers.base import Labeller, LabellerParams, harden, label_points
 from jaxmap.labellers.deeplab import make_deeplab_labeller, map_classes
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
+from jaxmap.models.architecture import torch_architecture
+from jaxmap.models.checkpoint import load_network, save_model
 from jaxmap.runs.segmentation import Segmenter
 from jaxmap.types import Frame, PointLabels, make_grid, make_stereo_camera
 
@@ -75,6 +77,19 @@ def test_labels_are_those_of_segment(size_px):
     chosen = np.take_along_axis(logits, np.asarray(labels).reshape(HEIGHT_PX, WIDTH_PX, 1), axis=-1)[..., 0]
     np.testing.assert_allclose(chosen, logits.max(axis=-1), atol=1e-4)
     assert len(np.unique(labels)) > 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fcn", "segnet", "unet"])
+def test_any_network_of_a_model_file_labels_as_segment_does(kind, tmp_path):
+    record = replace(torch_architecture("resnet18", NETWORK_CLASSES, kind=kind), head_channels=16)
+    save_model(tmp_path / "a.safetensors", record, seeded_weights(record))
+    saved = load_network(tmp_path / "a.safetensors")
+    labeller = make_deeplab_labeller(saved, soft=False, size_px=(40, 50))
+    labels = np.asarray(labelled(labeller._replace(label=jax.jit(labeller.label)), frame_of(image_of(0))).labels)
+    logits = Segmenter(saved, (40, 50)).logits(image_of(0))
+    chosen = np.take_along_axis(logits, labels.reshape(HEIGHT_PX, WIDTH_PX, 1), axis=-1)[..., 0]
+    np.testing.assert_allclose(chosen, logits.max(axis=-1), atol=1e-3)
 
 
 @pytest.mark.parametrize("size_px", [pytest.param(None, marks=pytest.mark.slow), (40, 50)], ids=str)

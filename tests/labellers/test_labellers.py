@@ -179,3 +179,16 @@ def test_background_is_left_out_where_the_ground_has_a_class_of_its_own():
     assert FusionOptions(left_out_classes=()).rule(CLASSES).left_out_classes == ()
     with pytest.raises(JaxmapError, match="sky is not one of the classes sand rock in fusion.left_out_classes"):
         FusionOptions(left_out_classes=("sky",)).rule(("sand", "rock"))
+
+
+@pytest.mark.parametrize("labeller", [PLANE, HARD, SOFT, make_no_labeller()], ids=lambda one: one.name)
+def test_a_labeller_draws_where_its_labels_depend_on_the_key(labeller):
+    labels, points = jnp.zeros((HEIGHT_PX, WIDTH_PX), jnp.uint8), beach(np.random.default_rng(0))
+    shares = jnp.zeros((*labels.shape, len(CLASSES)), jnp.float32)
+    frame = frame_of(labels=labels) if labeller.needs == "labels" else frame_of(class_probabilities=shares)
+
+    def label(key):
+        return label_points(labeller, frame, cloud_of(points, ALL), labeller.params, key)[0]
+
+    traced = jax.make_jaxpr(label)(jax.random.key(0)).jaxpr
+    assert any(traced.invars[0] in equation.invars for equation in traced.eqns) == labeller.draws

@@ -134,7 +134,7 @@ def test_a_death_at_any_step_leaves_a_map(tmp_path, monkeypatch, step, again) ->
 
     with monkeypatch.context() as patch:
         patch.setattr(map_store, "_write_group", deadly(map_store._write_group))
-        patch.setattr(map_store, "_sync_tree", deadly(map_store._sync_tree))
+        patch.setattr(map_store, "sync_tree", deadly(map_store.sync_tree))
         patch.setattr(map_store.os, "rename", deadly(os.rename))
         patch.setattr(map_store.shutil, "rmtree", deadly(shutil.rmtree))
         with suppress(Killed):
@@ -181,7 +181,7 @@ def test_a_refusing_disk_keeps_the_old_map(tmp_path, monkeypatch, number, messag
     def refuse(*_args, **_kwargs):
         raise OSError(number, os.strerror(number))
 
-    for place in (map_store.os, "rename"), (map_store, "_sync_tree"), (map_store, "_write_group"):
+    for place in (map_store.os, "rename"), (map_store, "sync_tree"), (map_store, "_write_group"):
         with monkeypatch.context() as patch:
             patch.setattr(*place, refuse)
             with pytest.raises(JaxmapError, match=message) as caught:

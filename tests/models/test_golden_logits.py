@@ -10,8 +10,8 @@ import pytest
 from golden.seeded_weights import GOLDEN, seeded_image, seeded_state_of
 from safetensors.numpy import save_file
 
-from jaxmap.models.deeplab import inference_network
 from jaxmap.models.importers import import_weights
+from jaxmap.models.network import inference_network
 
 STEP = 3
 QUICK = [("mobilenet_v2", 16, (64, 96))]

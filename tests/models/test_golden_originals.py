@@ -12,10 +12,11 @@ import pytest
 from golden.seeded_weights import seeded_image, seeded_state
 from safetensors.numpy import save_file
 
-from jaxmap.models import importers as tables
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import Architecture, tf_architecture
-from jaxmap.models.deeplab import fold_batch_norm, pure_network
-from jaxmap.models.importers import Row, convert, import_weights
+from jaxmap.models.import_tables import Row
+from jaxmap.models.importers import convert, import_weights
+from jaxmap.models.network import fold_batch_norm, pure_network
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "originals_golden.npz"
 CLASSES = ("class_0", "class_1", "class_2")

@@ -15,8 +15,8 @@ from jaxtyping import ArrayLike
 
 from jaxmap.models import heads
 from jaxmap.models.architecture import Architecture, torch_architecture
-from jaxmap.models.deeplab import fold_batch_norm, weight_shapes
 from jaxmap.models.heads import RELIEF_FEATURES, Decoder, separable_on_upsampled
+from jaxmap.models.network import fold_batch_norm, weight_shapes
 
 
 def normal(seed: int, *shape: int) -> np.ndarray:

@@ -11,15 +11,15 @@ from safetensors.numpy import save_file
 from torch_legacy import legacy_bytes
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models import importers as tables
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import (
     Architecture,
     tf_architecture,
     torch_architecture,
     torchvision_architecture,
 )
-from jaxmap.models.deeplab import weight_shapes
 from jaxmap.models.importers import VOC_CLASSES, convert, import_weights
+from jaxmap.models.network import weight_shapes
 
 DEEPEST = pytest.param("resnet101", marks=pytest.mark.slow)
 

@@ -9,7 +9,7 @@ from golden.seeded_weights import exported, seeded_image, seeded_weights
 from safetensors.numpy import save_file
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models import importers as tables
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import load_network, save_model
 from jaxmap.models.importers import import_weights

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import skimage
 
-from jaxmap.models.deeplab import pure_network
 from jaxmap.models.importers import VOC_CLASSES, import_weights
+from jaxmap.models.network import pure_network
 
 
 @pytest.fixture(scope="module")

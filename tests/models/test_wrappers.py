@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 from torch_zip import bfloat16, write_torch
 
 from jaxmap.errors import JaxmapError
-from jaxmap.models import importers as tables
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.importers import import_weights
 from jaxmap.models.wrappers import choose_network

@@ -67,7 +67,7 @@ def test_parts_hold_all_voxels_once_in_a_memory_that_does_not_grow():
     given, known = (np.concatenate(of) for of in zip(*pieces, strict=True))
     for ours, theirs in ((found, given), (labels, known)):
         np.testing.assert_array_equal(ours[np.lexsort(found.T)], theirs[np.lexsort(given.T)])
-    assert sum(part.count for part in parts) == len(given)
+    assert sum(part.voxels for part in parts) == len(given)
 
 
 def test_a_part_is_small():

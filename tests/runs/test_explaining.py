@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixtures import cli, finished_run, scene_folder, shared_cache  # noqa: F401
+from fixtures import cli, finished_run, map_words, scene_folder, shared_cache  # noqa: F401
 from truth_files import SITE, write_map
 
+from jaxmap.commands.main import main
 from jaxmap.errors import JaxmapError
 from jaxmap.mapping.store import load_map, save_map
 from jaxmap.runs.explaining import explain_cell, find_cell, frames_of, plan_again
@@ -54,7 +55,7 @@ def test_a_page_and_a_table_are_written_and_changes_are_refused(cli, finished_ru
     assert outcome.status == 0, outcome.err
     assert "the map" in outcome.out and "prior" in outcome.out and "why.html" in outcome.out
     page = out.read_text()
-    assert page.count("data:image/webp") >= 3 and "http" not in re.sub("<svg.*?</svg>", "", page, flags=re.S)
+    assert page.count("data:image/webp") >= 3 and "https:" not in re.sub("<svg.*?</svg>", "", page, flags=re.S)
     cell = find_cell(finished_run, (float(at[0]), float(at[1])))
     plan = plan_again(finished_run, cell, quiet)
     other = replace(cell, log_odds=cell.log_odds + np.float32(0.01))
@@ -78,3 +79,16 @@ def test_places_that_cannot_be_explained_name_the_nearest_that_can(cli, tmp_path
     voxel_map, attributes = load_map(run / "map.zarr")
     save_map(run / "map.zarr", replace(voxel_map, log_odds=0 * voxel_map.log_odds), attributes)
     assert "nothing was observed in this map at all" in cli("explain", run, "--at", east, north).error
+
+
+@pytest.mark.slow
+def test_what_was_kept_explains_the_map_that_was_fused_from_it(scene_folder, tmp_path):
+    run = tmp_path / "run"
+    assert main(map_words(scene_folder, run, "--keep-observations", "--start", 1, "--stop", 4)) == 0
+    voxel_map, _ = load_map(run / "map.zarr")
+    column = np.argwhere((np.asarray(voxel_map.log_odds)[0] > 1).any(axis=-1))[60]
+    at = np.asarray(voxel_map.grid.origin_m)[:2] + (column + 0.5) * np.asarray(voxel_map.grid.voxel_size_m)[:2]
+    cell = find_cell(run, (float(at[0]), float(at[1])))
+    plan = plan_again(run, cell, quiet)
+    explained = explain_cell(run, cell, plan, frames_of(cell, plan))
+    np.testing.assert_allclose(sum(part.evidence for part in explained.parts), explained.evidence, atol=1e-4)

@@ -17,7 +17,7 @@ from jaxmap.datasets.base import FrameRef
 from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.errors import JaxmapError
 from jaxmap.report.first_seen import first_seen
-from jaxmap.report.recording import check_viewer
+from jaxmap.report.recording import check_viewer, recording
 from jaxmap.report.run_contents import read_run
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.run_frames import read_run_frames, write_frame_table
@@ -35,14 +35,16 @@ def run(tmp_path) -> Path:
     """A run of 21 frames, of which the last but one was skipped."""
     run = make_run(tmp_path / "run")
     add_cameras(run)
-    metrics = json.loads((run / "metrics.json").read_text())
-    metrics["camera"] |= {"baseline_m": 0.12, "doffs_px": 0.0, "T_raw_rectified": np.eye(4).tolist()}
-    (run / "metrics.json").write_text(json.dumps(metrics))
     # Looking east and down.
     T = np.tile(np.array([[0.0, -0.3, 0.95, 0], [-1, 0, 0, 0], [0, -0.95, -0.3, 0], [0, 0, 0, 1]]), (20, 1, 1))
     T[:, :3, :3] /= np.linalg.norm(T[:, :3, :3], axis=1, keepdims=True)
     T[:, :3, 3] = read_poses(run / "poses.tum").T[:, :3, 3]
     write_tum(run / "poses.tum", 100.0 + np.array([*range(19), 20]), T)
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics["camera"] |= {"baseline_m": 0.12, "doffs_px": 0.0, "T_raw_rectified": np.eye(4).tolist()}
+    local = T - np.pad(SITE[:, None], ((0, 1), (3, 0)))
+    metrics["camera"]["key_frames"] = {"000000": local[0].tolist(), "000020": local[-1].tolist()}
+    (run / "metrics.json").write_text(json.dumps(metrics))
     write_frame_table(run / "frames.csv", frame_names(21), {"left, 19": 'it is "black"'})
     return run
 
@@ -105,6 +107,9 @@ def test_a_run_becomes_a_recording(cli, run, tmp_path) -> None:
     poses = sorted((row["frame"], row["Transform3D:translation"][0]) for row in rows["/world/camera"])
     assert [frame for frame, _ in poses] == [*range(19), 20]
     np.testing.assert_allclose(poses[0][1], [-3, 0, 1.2], atol=1e-5)
+    expected = read_run_frames(RunFolder(run), SITE).T_world_camera[0, :3, :3]
+    turned = next(row["Transform3D:mat3x3"][0] for row in rows["/world/camera"] if row["frame"] == 0)
+    np.testing.assert_allclose(np.reshape(turned, (3, 3), order="F"), expected, atol=1e-6)
     for entity in ("/world/camera/left", "/labels", "/disparity"):
         assert sorted({row["frame"] for row in rows[entity] if row.get("EncodedImage:blob")}) == [0, 20]
     pinhole = next(row for row in rows["/world/camera/left"] if row.get("Pinhole:resolution"))
@@ -125,6 +130,9 @@ def test_a_run_becomes_a_recording(cli, run, tmp_path) -> None:
 def test_a_run_from_before_says_what_it_shows(cli, run, tmp_path) -> None:
     pytest.importorskip("rerun")
     (run / "frames.csv").unlink()
+    assert cli("view", run, "--save", tmp_path / "f.rrd").status == 0
+    pictures = rows_of(tmp_path / "f.rrd")["/labels"]
+    assert sorted({row["frame"] for row in pictures}) == [0, 19], "by where they were taken"
     metrics = json.loads((run / "metrics.json").read_text())
     del metrics["camera"]
     (run / "metrics.json").write_text(json.dumps(metrics))
@@ -151,6 +159,22 @@ def test_what_a_viewer_needs(cli, run, tmp_path, monkeypatch) -> None:
     with pytest.raises(JaxmapError, match=r"no display .* rerun F.rrd"):
         check_viewer(None)
     assert "no such run folder" in cli("view", tmp_path / "nowhere", "--save", tmp_path / "f.rrd").error
+
+
+@pytest.mark.slow
+def test_what_is_interrupted_leaves_a_file_and_what_fails_none(tmp_path) -> None:
+    pytest.importorskip("rerun")
+
+    def record(path: Path, fault: BaseException) -> None:
+        with pytest.raises(type(fault)), recording("name", ("sand",), path) as log:
+            log.at(3, 2.0)
+            log.pose(np.eye(4))
+            raise fault
+
+    record(tmp_path / "stopped.rrd", KeyboardInterrupt())
+    assert rows_of(tmp_path / "stopped.rrd")["/world/camera"][0]["frame"] == 3
+    record(tmp_path / "failed.rrd", ValueError())
+    assert [path.name for path in tmp_path.iterdir()] == ["stopped.rrd"]
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from golden.seeded_weights import exported
 from PIL import Image
 from safetensors.numpy import save_file
 
-from jaxmap.models import importers as tables
+from jaxmap.models import import_tables as tables
 from jaxmap.models.architecture import torch_architecture
 from jaxmap.models.checkpoint import load_model
 from jaxmap.runs import weights as weight_files

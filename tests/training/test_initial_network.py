@@ -12,7 +12,7 @@ from tiny_training import compiled_quickly
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture
 from jaxmap.models.checkpoint import SavedModel
-from jaxmap.models.deeplab import weight_shapes
+from jaxmap.models.network import weight_shapes
 from jaxmap.training.initial_network import InitialNetwork, make_initial_network
 from jaxmap.training.options import BatchNormOptions, NetworkOptions
 
@@ -159,6 +159,49 @@ def test_fresh_networks_see_at_several_scales_in_either_family(stride, rates):
 )
 def test_norms_train_as_the_options_say(norm, expected):
     assert start_of(saved(holds="backbone"), **norm).batch_norms == expected
+
+
+@pytest.mark.parametrize(("kind", "name"), [("fcn", "FCN-8s"), ("segnet", "SegNet"), ("unet", "U-Net")])
+def test_of_another_kind_of_network_the_backbone_alone_is_kept(kind, name):
+    tf = replace(tf_architecture("mobilenet_v2", CLASSES), head_channels=8, low_level_channels=4)
+    for init in (saved(), saved(tf)):
+        start = start_of(init, NetworkOptions(kind=kind))
+        record, trained = start.architecture, init.architecture
+        assert (record.name, record.output_stride, record.size_remainder) == (name, 32, 0)
+        assert (record.padding, record.backbone_eps, record.mean) == (
+            trained.padding,
+            trained.backbone_eps,
+            trained.mean,
+        )
+        assert kept(start, init) == {"backbone"}
+        parts = {part.split(".")[0] for part in start.weights}
+        assert set(start.fresh) == parts - {"backbone"} and set(start.batch_norms) == set(start.fresh) - {"classifier"}
+    # Of the same kind all is kept, without a word about it.
+    again = start_of(saved(record), NetworkOptions())
+    assert again.architecture == record and again.fresh == ()
+
+
+def test_an_fcn_without_a_decoder_has_any_stride():
+    network = NetworkOptions(kind="fcn", decoder=False, output_stride=8)
+    for init in (None, saved()):
+        record = start_of(init, network).architecture
+        assert (record.name, record.output_stride, record.decoder) == ("FCN", 8, False)
+    with pytest.raises(JaxmapError, match="FCN-8s at output stride 8"):
+        start_of(None, replace(network, decoder=None))
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "name"),
+    [
+        ("fcn", {"atrous_rates": (2,)}, "network.atrous-rates"),
+        ("unet", {"decoder": True}, "network.decoder"),
+        ("segnet", {"head_channels": 8}, "network.head-channels"),
+        ("unet", {"relief": True}, "network.relief"),
+    ],
+)
+def test_an_option_that_means_nothing_to_the_kind_is_refused(kind, options, name):
+    with pytest.raises(UsageError, match=f"{name} is given, which means nothing to {kind}"):
+        start_of(None, NetworkOptions(kind=kind, **options))
 
 
 def test_a_network_that_cannot_be_built_is_refused():

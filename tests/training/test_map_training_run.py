@@ -20,7 +20,7 @@ from truth_files import write_raster
 from jaxmap.errors import JaxmapError
 from jaxmap.labels import IGNORE, ROVER_CLASSES
 from jaxmap.models.checkpoint import load_network, save_model
-from jaxmap.models.deeplab import initial_weights
+from jaxmap.models.network import initial_weights
 from jaxmap.runs.map_training import plan_map_training
 from jaxmap.runs.training import TrainingFolder, TrainingRun
 from jaxmap.runs.training_plan import TRAIN_SETTINGS, TrainConfig, TrainingPlan

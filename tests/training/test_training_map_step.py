@@ -21,7 +21,7 @@ from jaxmap.evaluation.cells import column_shares, make_cells
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.labels import IGNORE, ROVER_CLASSES
-from jaxmap.models.deeplab import initial_weights
+from jaxmap.models.network import initial_weights
 from jaxmap.training.options import AugmentationOptions, OptimiserOptions, TrainingOptions
 from jaxmap.training.step import parted
 from jaxmap.tuning.frame_crops import FrameBatch

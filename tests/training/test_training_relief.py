@@ -21,7 +21,7 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.geometry.relief import RELIEF_CHANNELS, relief_channels, relief_of
 from jaxmap.host.files import bundled
 from jaxmap.models.checkpoint import load_network
-from jaxmap.models.deeplab import initial_weights
+from jaxmap.models.network import initial_weights
 from jaxmap.runs.training_plan import TrainConfig, plan_image_training
 from jaxmap.training.batches import ExampleOrder, ExampleReader
 from jaxmap.training.data import TrainingSet, check_training_set, digest, open_training_set, with_stereo

@@ -18,7 +18,7 @@ from tiny_training import ARCHITECTURE, network_is_tiny, tiny_network  # noqa: F
 from training_data import CLASSES, scene
 
 import jaxmap
-from jaxmap.models.deeplab import Weights, initial_weights, pure_network
+from jaxmap.models.network import Weights, initial_weights, pure_network
 from jaxmap.training.augment import augment
 from jaxmap.training.options import AugmentationOptions, OptimiserOptions, PixelLossOptions, TrainingOptions
 from jaxmap.training.step import Batch, StepMetrics, Trainer, TrainState, make_trainer

@@ -19,8 +19,9 @@ from jaxtyping import Array
 from training_data import CLASSES, write_data
 
 from jaxmap.commands.main import main
-from jaxmap.models import deeplab
+from jaxmap.models import backbones, network
 from jaxmap.models.architecture import Architecture, torch_architecture
+from jaxmap.models.backbones import Pyramid
 from jaxmap.models.layers import ConvBlock
 
 CONFIG = """\
@@ -53,11 +54,11 @@ class TinyBackbone(nnx.Module):
         norm = "batch" if record.backbone_norm else "bias"
         self.stem = ConvBlock(3, 8, 3, stride=2, norm=norm, eps=record.backbone_eps)
         self.deep = ConvBlock(8, 16, 3, stride=2, norm=norm, eps=record.backbone_eps)
-        self.channels = self.low_level_channels = 16
+        self.channels = (16, 16)
 
-    def __call__(self, images: Array) -> tuple[Array, Array]:
+    def __call__(self, images: Array) -> Pyramid:
         features = self.deep(self.stem(images))
-        return features, features
+        return Pyramid((features, features), ())
 
 
 @contextmanager
@@ -74,16 +75,16 @@ def unoptimised() -> Iterator[None]:
 @contextmanager
 def tiny_network() -> Iterator[None]:
     """Within it, `mobilenet_v2` names the tiny backbone, and programs are compiled with few optimisations."""
-    backbones: dict = deeplab._BACKBONES
-    before = backbones["mobilenet_v2"]
-    backbones["mobilenet_v2"] = TinyBackbone
-    deeplab.weight_shapes.cache_clear()
+    builders: dict = backbones.BUILDERS
+    before = builders["mobilenet_v2"]
+    builders["mobilenet_v2"] = TinyBackbone
+    network.weight_shapes.cache_clear()
     try:
         with unoptimised():
             yield
     finally:
-        backbones["mobilenet_v2"] = before
-        deeplab.weight_shapes.cache_clear()
+        builders["mobilenet_v2"] = before
+        network.weight_shapes.cache_clear()
 
 
 @pytest.fixture(scope="module", autouse=True)

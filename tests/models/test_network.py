@@ -25,19 +25,19 @@ from jaxmap.models.architecture import (
     torchvision_architecture,
 )
 from jaxmap.models.backbones import InvertedResidual, ResidualUnit, XceptionUnit
-from jaxmap.models.deeplab import (
-    DeepLab,
+from jaxmap.models.base import padded_size, placed_relief
+from jaxmap.models.heads import Aspp, Decoder
+from jaxmap.models.network import (
+    KINDS,
     fold_batch_norm,
     inference_network,
+    initial_weights,
     make_network,
     network_weights,
-    padded_size,
-    placed_relief,
     pure_network,
     training_form,
     weight_shapes,
 )
-from jaxmap.models.heads import Aspp, Decoder
 
 CLASSES = ("background", "sand", "rock")
 SMALL = replace(torch_architecture("mobilenet_v2", CLASSES), top_conv=False, head_channels=8, low_level_channels=4)
@@ -124,6 +124,15 @@ def test_the_network_of_a_key_is_always_the_same():
     assert not np.array_equal(one["backbone.stem.kernel"], other["backbone.stem.kernel"])
 
 
+@pytest.mark.parametrize("kind", ["deeplab", "fcn", "segnet", "unet"])
+def test_classifiers_start_with_logits_on_the_scale_of_the_features(kind):
+    record = replace(torch_architecture("mobilenet_v2", CLASSES, kind=kind), top_conv=False)
+    for name, kernel in initial_weights(record, jax.random.key(0)).items():
+        if name.startswith("classifier.") and name.endswith(".kernel"):
+            spread = np.asarray(kernel).std() * np.prod(kernel.shape[:3]) ** 0.5
+            assert abs(spread - 1) < 0.3, name
+
+
 QUICK_STRIDES = [(torch_architecture, 8, "mobilenet_v2"), (torch_architecture, 16, "efficientnet_lite0")]
 ALL_STRIDES = [
     (*family, name)
@@ -138,12 +147,16 @@ ALL_STRIDES = [
 )
 def test_every_backbone_has_the_right_strides(backbone, stride, family):
     architecture = family(backbone, CLASSES, output_stride=stride)
-    network = nnx.eval_shape(lambda: DeepLab(architecture))
+    network = nnx.eval_shape(lambda: KINDS[architecture.kind](architecture))
     sizes = [padded_size(size, architecture) for size in (50, 65)]
     images = jax.ShapeDtypeStruct((1, *sizes, 3), jnp.float32)
-    features, low_level = nnx.eval_shape(lambda model, x: model.backbone(x), network, images)
-    assert features.shape == (1, *(-(-size // stride) for size in sizes), network.backbone.channels)
-    assert low_level.shape == (1, *(-(-size // 4) for size in sizes), network.backbone.low_level_channels)
+    levels, places = nnx.eval_shape(lambda model, x: model.backbone(x), network, images)
+    strides = [step for step in (4, 8, 16) if step <= stride]
+    assert [level.shape for level in levels] == [
+        (1, *(-(-size // step) for size in sizes), channels)
+        for step, channels in zip(strides, network.backbone.channels, strict=True)
+    ]
+    assert places == ()
 
 
 def test_tensorflow_sizes_are_a_multiple_and_one():
