@@ -29,8 +29,8 @@ FORMATS: dict[str, Format] = {
     "laz": Format(("map.laz",), "jaxmap.export.las:write_las"),
     "octomap": Format(("map.ot", "map.bt"), "jaxmap.export.octomap_trees:write_octomap"),
     "nav2": Format(("map.yaml", "map.pgm", "costs.yaml", "costs.png"), "jaxmap.export.nav2:write_nav2"),
-    "gridmap": Format(("grid_map.mcap",), "jaxmap.export.grid_map:write_grid_map"),
-    "foxglove": Format(("foxglove.mcap",), "jaxmap.export.foxglove:write_foxglove"),
+    "grid-map": Format(("grid_map.mcap",), "jaxmap.export.grid_map:write_grid_map"),
+    "mcap": Format(("run.mcap",), "jaxmap.export.foxglove:write_foxglove"),
     "lac": Format(("lac.npy",), "jaxmap.export.lunar_challenge:write_lunar_challenge"),
     "colmap": Format(("colmap",), "jaxmap.runs.colmap:export_colmap"),
 }

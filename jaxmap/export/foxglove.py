@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmap.export.source import Camera, Source, Track, optional
+from jaxmap.export.source import Camera, Source, Track, optional, stamp_ns
 from jaxmap.export.voxels import OccupiedVoxels
 from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE
@@ -39,9 +39,9 @@ def write_foxglove(source: Source, path: Path) -> None:
     with atomic_path(path) as temporary, temporary.open("wb") as stream, writer_module.Writer(stream) as writer:
 
         def send(topic: str, time_s: float, kind: str, **values: Any) -> None:
-            stamp_ns = round(time_s * 1e9)
-            message = _message(kind, timestamp=_stamp(stamp_ns), **values)
-            writer.write_message(topic, message, stamp_ns, stamp_ns)
+            at_ns = stamp_ns(time_s)
+            message = _message(kind, timestamp=_stamp(at_ns), **values)
+            writer.write_message(topic, message, at_ns, at_ns)
 
         for topic, kind, values in _poses(track):
             send(topic, first_s, kind, **values)
@@ -162,10 +162,10 @@ def _pose(position: np.ndarray, xyzw: np.ndarray | None = None) -> Any:
     )
 
 
-def _stamp(stamp_ns: int) -> Any:
+def _stamp(at_ns: int) -> Any:
     from google.protobuf.timestamp_pb2 import Timestamp
 
-    return Timestamp(seconds=stamp_ns // 10**9, nanos=stamp_ns % 10**9)
+    return Timestamp(seconds=at_ns // 10**9, nanos=at_ns % 10**9)
 
 
 def _message(kind: str, **values: Any) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmap.errors import JaxmapError
-from jaxmap.export.source import Source, optional
+from jaxmap.export.source import Source, optional, stamp_ns
 from jaxmap.host.files import atomic_path
 from jaxmap.labels import IGNORE
 
@@ -53,14 +53,16 @@ def write_grid_map(source: Source, path: Path) -> None:
             if topic not in channels:
                 schema = writer.register_schema(kind, "ros2msg", store.generate_msgdef(kind, ros_version=2)[0].encode())
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
-            stamp_ns = round(time_s * 1e9)
-            writer.add_message(channels[topic], stamp_ns, bytes(store.serialize_cdr(message, kind)), stamp_ns)
+            at_ns = stamp_ns(time_s)
+            writer.add_message(channels[topic], at_ns, bytes(store.serialize_cdr(message, kind)), at_ns)
         writer.finish()
 
 
 def _grid_map(store: Any, source: Source, time_s: float) -> Any:
     edge_m = source.square_cells("grid_map")
-    columns = source.observed_whole(_MOST_CELLS, "grid_map")
+    columns = source.whole(_MOST_CELLS, "grid_map")
+    if columns is None:
+        raise source.nothing_observed("grid_map")
     top, (width, depth) = columns.top, columns.top.observed.shape
     if max(width, depth) > 2**16 - 1:
         raise JaxmapError(
@@ -140,6 +142,6 @@ def _quaternion(store: Any, xyzw: np.ndarray) -> Any:
 
 
 def _header(store: Any, time_s: float) -> Any:
-    stamp_ns = round(time_s * 1e9)
-    stamp = store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    sec, nanosec = divmod(stamp_ns(time_s), 10**9)
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
     return store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME)

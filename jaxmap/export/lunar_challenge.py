@@ -48,7 +48,8 @@ def write_lunar_challenge(source: Source, path: Path) -> None:
         observed = np.asarray(columns.top.observed)
         part, place = np.ix_(*picked), np.ix_(*at)
         height_m[place] = np.where(observed, columns.height_m, np.nan)[part]
-        rock[place] = np.asarray(columns.top.label)[part] == source.target
+        label = np.asarray(columns.top.label)
+        rock[place] = label[part] == source.target
         seen += int(observed.sum())
     known = ~np.isnan(height_m)
     if not known.any():
@@ -67,6 +68,6 @@ def write_lunar_challenge(source: Source, path: Path) -> None:
     centre_m = along_m.reshape(cells, POINTS).mean(axis=1)
     table[..., 0], table[..., 1] = centre_m[:, None], centre_m[None, :]
     table[counts > 0, 2] = total_m[counts > 0] / counts[counts > 0]
-    table[counts > 0, 3] = rock.reshape(grouped).any(axis=(1, 3))[counts > 0]
+    table[counts > 0, 3] = (rock.reshape(grouped).sum(axis=(1, 3)) > 0)[counts > 0]
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, table, allow_pickle=False)

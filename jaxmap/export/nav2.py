@@ -14,7 +14,7 @@ from jaxmap.host.files import atomic_path
 COST_LAYER = "cost"
 """The layer of a map that holds what a metre of driving costs, in metres of level driving: 1 or more."""
 FREE, UNKNOWN, OCCUPIED = 254, 205, 0
-_MOST_CELLS = 1 << 28
+_MOST_CELLS = 1 << 27
 
 
 def write_nav2(source: Source, map_yaml: Path, map_image: Path, costs_yaml: Path, costs_image: Path) -> None:
@@ -37,11 +37,20 @@ def write_nav2(source: Source, map_yaml: Path, map_image: Path, costs_yaml: Path
             fix="map with a labeller that knows rocks",
         )
     edge_m = source.square_cells("nav2")
-    columns = source.observed_whole(_MOST_CELLS, "nav2")
-    corner_m = source.corner_m[:2] + np.asarray(columns.corner) * source.size_m[:2]
-    for image, settings, (pixels, mode) in (
-        (map_image, map_yaml, (trinary(columns, source.target), "trinary")),
-        (costs_image, costs_yaml, (scaled(costs(columns, source.target)), "scale")),
+    box = source.observed_box(_MOST_CELLS, "nav2")
+    if box is None:
+        raise source.nothing_observed("nav2")
+    corner, shape = box
+    corner_m = source.corner_m[:2] + np.asarray(corner) * source.size_m[:2]
+    obstacles, greys = np.full(shape, UNKNOWN, np.uint8), np.zeros((*shape, 2), np.uint8)
+    for columns in source.columns():
+        x, y = np.argwhere(columns.top.observed).T
+        to = columns.moved(x, y, corner)
+        obstacles[to] = np.where(np.asarray(columns.top.label)[x, y] == source.target, OCCUPIED, FREE)
+        greys[to] = _scaled(_costs(columns, source.target)[x, y])
+    for image, settings, pixels, mode in (
+        (map_image, map_yaml, obstacles, "trinary"),
+        (costs_image, costs_yaml, greys, "scale"),
     ):
         free, occupied = (0.196, 0.65) if mode == "trinary" else (0.5 / 255, 1 - 0.5 / 255)
         with atomic_path(image) as temporary:
@@ -59,21 +68,13 @@ def write_nav2(source: Source, map_yaml: Path, map_image: Path, costs_yaml: Path
             temporary.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def trinary(columns: Columns, target: int) -> UInt8[np.ndarray, "X Y"]:
-    """Grey values of obstacles (the label `target`), free and unknown cells."""
-    top = columns.top
-    return np.where(top.observed, np.where(top.label == target, OCCUPIED, FREE), UNKNOWN).astype(np.uint8)
-
-
-def costs(columns: Columns, target: int) -> Float[np.ndarray, "X Y"]:
+def _costs(columns: Columns, target: int) -> Float[np.ndarray, "X Y"]:
     """Costs from 0 to 1, NaN where they are not known: `1 - 1 / cost` of the layer, or else the probability of rock."""
     layer = columns.layers.get(COST_LAYER)
-    if layer is None:
-        return np.where(columns.top.observed, columns.top.probability[target], np.nan)
-    return 1 - 1 / np.maximum(layer, 1)
+    return np.asarray(columns.top.probability)[target] if layer is None else 1 - 1 / np.maximum(layer, 1)
 
 
-def scaled(cost: Float[np.ndarray, "X Y"]) -> UInt8[np.ndarray, "X Y 2"]:
+def _scaled(cost: Float[np.ndarray, "N"]) -> UInt8[np.ndarray, "N 2"]:
     """Grey value and opacity of costs: white costs nothing, black everything, what is not known is transparent."""
     known = ~np.isnan(cost)
     grey = np.where(known, 255 - np.rint(np.nan_to_num(cost) * 255), UNKNOWN)

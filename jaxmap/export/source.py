@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64, Int, UInt8
 
 from jaxmap.errors import JaxmapError
 from jaxmap.export.voxels import OccupiedVoxels, occupied_voxels
@@ -53,6 +53,10 @@ class Columns(NamedTuple):
         surface = self.layers.get(SURFACE)
         height_m = np.asarray(self.top.height_m)
         return height_m if surface is None else np.where(self.top.observed & ~np.isnan(surface), surface, height_m)
+
+    def moved(self, x: Int[np.ndarray, "N"], y: Int[np.ndarray, "N"], corner: tuple[int, int]) -> tuple[Any, Any]:
+        """Indices of this part's cells in an array that begins at a corner of the grid."""
+        return x + self.corner[0] - corner[0], y + self.corner[1] - corner[1]
 
 
 class Camera(NamedTuple):
@@ -185,7 +189,8 @@ class Source:
                 tile = index[:, :2] // TILE[:2]
                 order = np.lexsort((tile[:, 1], tile[:, 0]))
                 order = order[keep[order]]
-                yield OccupiedVoxels(index[order], *(leaf[order] for leaf in voxels[1:4]), voxels.voxel_size_m)
+                centres, label, probability = (leaf[order] for leaf in voxels[1:4])
+                yield OccupiedVoxels(index[order], centres, label, probability, voxels.voxel_size_m)
 
     def columns(self, margin: int = 0) -> Iterator[Columns]:
         """The top-down map, block by block, with as many columns around each as there are."""
@@ -204,11 +209,11 @@ class Source:
             inner = tuple(slice(low - a, high - a) for a, (low, high) in zip(lows, sides, strict=True))
             yield Columns((x, y), top, layers, (inner[0], inner[1]))
 
-    def whole(self, most_cells: int, form: str) -> Columns | None:
-        """The observed part of the top-down map as one, for forms that are one array; None where nothing was observed.
+    def observed_box(self, most_cells: int, form: str) -> tuple[tuple[int, int], tuple[int, int]] | None:
+        """Corner and size of the observed part of the top-down map, in columns; None where nothing was observed.
 
         Args:
-            most_cells: that it may have.
+            most_cells: that a form holds.
             form: its name, for the message.
 
         Raises:
@@ -220,39 +225,38 @@ class Source:
                 low, high = np.minimum(low, cells.min(0) + corner), np.maximum(high, cells.max(0) + 1 + corner)
         if (high <= low).any():
             return None
-        width, depth = (high - low).tolist()
+        (x, y), (width, depth) = low.tolist(), (high - low).tolist()
         if width * depth > most_cells:
             raise JaxmapError(
                 f"{width} x {depth} cells are more than the {most_cells:,} that one map of {form} holds",
                 where=self.where,
                 fix="map with larger voxels, or within --grid.lower-m and --grid.upper-m",
             )
+        return (x, y), (width, depth)
+
+    def whole(self, most_cells: int, form: str) -> Columns | None:
+        """The observed part of the top-down map as one, for forms that are one array; see `observed_box`."""
+        box = self.observed_box(most_cells, form)
+        if box is None:
+            return None
+        corner, (width, depth) = box
         whole: Any = unknown_top(len(self.classes), (width, depth))
         layers = {name: np.full((width, depth), np.nan, np.float32) for name in self.reader.attributes.layers}
-        for corner, top, known, _ in self.columns():
-            start = np.asarray(corner) - low
-            x, y = np.argwhere(top.observed).T
-            to = (x + start[0], y + start[1])
-            whole.probability[:, *to] = top.probability[:, x, y]
-            for into, values in zip(whole[1:], top[1:], strict=True):
+        for columns in self.columns():
+            x, y = np.argwhere(columns.top.observed).T
+            to = columns.moved(x, y, corner)
+            whole.probability[:, *to] = columns.top.probability[:, x, y]
+            for into, values in zip(whole[1:], columns.top[1:], strict=True):
                 into[to] = values[x, y]
-            for name, values in known.items():
+            for name, values in columns.layers.items():
                 layers[name][to] = values[x, y]
-        corner = (int(low[0]), int(low[1]))
         return Columns(corner, whole, layers, (slice(0, width), slice(0, depth)))
 
-    def observed_whole(self, most_cells: int, form: str) -> Columns:
-        """`whole`, where a form needs something.
-
-        Raises:
-            JaxmapError: nothing was observed, or it has more cells.
-        """
-        columns = self.whole(most_cells, form)
-        if columns is None:
-            raise JaxmapError(
-                f"nothing was observed: there is no map of {form}", where=self.where, fix="see the notes of its report"
-            )
-        return columns
+    def nothing_observed(self, form: str) -> JaxmapError:
+        """The error of a form that needs something."""
+        return JaxmapError(
+            f"nothing was observed: there is no map of {form}", where=self.where, fix="see the notes of its report"
+        )
 
 
 def unknown_top(classes: int, shape: tuple[int, int]) -> TopDown:
@@ -267,6 +271,17 @@ def unknown_top(classes: int, shape: tuple[int, int]) -> TopDown:
 def absolute(layers: Mapping[str, Float[np.ndarray, "X Y"]], site_z_m: float) -> dict[str, Float[np.ndarray, "X Y"]]:
     """The layers of a map with heights in the coordinate reference system of its site."""
     return {name: values + site_z_m if name == SURFACE else values for name, values in layers.items()}
+
+
+def stamp_ns(time_s: float) -> int:
+    """A time in whole nanoseconds, as logs count them.
+
+    Raises:
+        JaxmapError: it is negative, which a log cannot hold.
+    """
+    if time_s < 0:
+        raise JaxmapError(f"a frame has the time {time_s:g} s, logs begin at 0", fix="give times from 0 on")
+    return round(time_s * 1e9)
 
 
 def optional(module: str, package: str, what: str) -> ModuleType:

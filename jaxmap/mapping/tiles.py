@@ -251,7 +251,10 @@ class MovingBlock:
         if (box[0] < first).any() or (box[1] > first + self._shape).any():
             self._check_holds(box, len(views))
             self.write_changes(voxel_map)
-            voxel_map = self._load(self._around(box), int(voxel_map.frames_fused))
+            count = int(voxel_map.frames_fused)
+            # Freed before the next one is made: a block is most of the memory.
+            voxel_map.log_odds.delete()
+            voxel_map = self._load(self._around(box), count)
         for view in views:
             self._touched |= set(tiles_of(self.store.grid, view))
         return voxel_map

@@ -48,7 +48,7 @@ def write_exports(
         JaxmapError: a form cannot hold the map, the run has lost what it needs, or the disk is full or refuses; forms
             before it are written.
     """
-    frames = _read_frames(folder) if colours == "images" or "foxglove" in formats else {}
+    frames = _read_frames(folder) if colours == "images" or "mcap" in formats else {}
     if colours == "images" and not frames:
         raise JaxmapError(
             "the run has no pictures of key frames to take colours from",

@@ -27,23 +27,18 @@ from jaxmap.errors import JaxmapError
 from jaxmap.geometry.bounds import view_boxes
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.executors import Workers, run_tasks
-from jaxmap.mapping.regions import (
+from jaxmap.mapping.parts import (
     KeptTiles,
-    Region,
-    Shape,
     TileRecord,
     assemble_map,
-    frames_of_tiles,
-    fuse_region,
     kept_tiles,
     part_name,
     part_tiles,
     read_record,
     read_told,
-    regions_of,
-    tile_sources,
     write_part,
 )
+from jaxmap.mapping.regions import Region, Shape, frames_of_tiles, fuse_region, regions_of, tile_sources
 from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import StepReport
 from jaxmap.mapping.store import open_map

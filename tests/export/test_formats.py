@@ -79,12 +79,15 @@ def test_a_map_without_classes_or_crs_is_written_or_refused_whole(name, tmp_path
         ("las", "laspy"),
         ("laz", "lazrs"),
         ("octomap", "octomap"),
-        ("gridmap", "mcap"),
-        ("foxglove", "mcap_protobuf"),
-        ("foxglove", "foxglove_schemas_protobuf"),
+        ("grid-map", "mcap"),
+        ("mcap", "mcap_protobuf"),
+        ("mcap", "foxglove_schemas_protobuf"),
     ],
 )
 def test_a_missing_library_is_named_with_its_command(name, module, tmp_path, monkeypatch) -> None:
+    # What is imported for the first time meanwhile would never find it again.
+    for loaded in ("laspy", "lazrs", "mcap_protobuf.writer"):
+        import_module(loaded)
     for loaded in (module, f"{module}.writer"):
         monkeypatch.setitem(__import__("sys").modules, loaded, None)
     with pytest.raises(JaxmapError, match=r"is not installed.*pip install 'jaxmap\[formats\]'"):
@@ -315,7 +318,7 @@ def test_rosbags_reads_grid_map(tmp_path) -> None:
     track = short_track()
     source = source_of(hill(), beside=dict(track=track))
     top = top_of(source)
-    (path,) = write("gridmap", source, tmp_path)
+    (path,) = write("grid-map", source, tmp_path)
     store, messages = get_typestore(Stores.ROS2_JAZZY), {}
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
@@ -353,7 +356,7 @@ def test_foxglove_decodes_the_run(tmp_path) -> None:
     source = source_of(
         hill((0.2, 0.2, 0.1)), beside=dict(track=track), layers={"slope_deg": np.ones((10, 8), np.float32)}
     )
-    (path,) = write("foxglove", source, tmp_path)
+    (path,) = write("mcap", source, tmp_path)
     messages: dict[str, list] = {}
     with path.open("rb") as stream:
         for schema, channel, message, decoded in reader_of(stream).iter_decoded_messages():

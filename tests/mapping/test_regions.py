@@ -24,19 +24,8 @@ from jaxmap.geometry.grid import window_shape
 from jaxmap.labellers.plane import PlaneOptions, make_plane_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.attributes import MapAttributes
-from jaxmap.mapping.regions import (
-    TileRecord,
-    assemble_map,
-    frames_of_tiles,
-    fuse_region,
-    kept_tiles,
-    part_tiles,
-    read_record,
-    region_shape,
-    regions_of,
-    tile_sources,
-    write_part,
-)
+from jaxmap.mapping.parts import TileRecord, assemble_map, kept_tiles, part_tiles, read_record, write_part
+from jaxmap.mapping.regions import frames_of_tiles, fuse_region, region_shape, regions_of, tile_sources
 from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.mapping.store import load_map

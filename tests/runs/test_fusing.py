@@ -19,7 +19,7 @@ import jaxmap.runs.fusing as fusing
 from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.host.executors import Workers
-from jaxmap.mapping.regions import read_record
+from jaxmap.mapping.parts import read_record
 from jaxmap.mapping.store import load_map
 from jaxmap.runs.config import MapConfig, config_of_observations
 from jaxmap.runs.folder import RunFolder
