@@ -218,7 +218,8 @@ class VoxelMap:
 
     Channel 0 is occupancy, channel `1 + c` is class `c`. A voxel that nothing has touched holds
     exact zeros; priors are added when the map is read (`fusion.query`), so that maps can be summed.
-    `members` are those of an ensemble (`ensemble.members`), two channels each, where there is one.
+    `members` are those of an ensemble (`ensemble.members`), two channels each, where there is one; `surface` are the
+    heights of each column (`fusion.surface`), where they are kept.
     """
 
     log_odds: Float[Array, "K X Y Z"]
@@ -226,10 +227,11 @@ class VoxelMap:
     grid: GridSpec
     classes: tuple[str, ...] = field(metadata=_static())
     members: Float[Array, "M 2 X Y Z"] | None = None
+    surface: Float[Array, "4 X Y"] | None = None
 
 
-def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0) -> VoxelMap:
-    """An empty map, with as many members of an ensemble.
+def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0, *, surface: bool = False) -> VoxelMap:
+    """An empty map, with as many members of an ensemble, and statistics of heights where asked for.
 
     Raises:
         JaxmapError: the tensor would have more elements than a 32-bit index can reach.
@@ -247,6 +249,7 @@ def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0) -> 
         grid=grid,
         classes=tuple(classes),
         members=jnp.zeros((members, 2, *grid.shape), jnp.float32) if members else None,
+        surface=jnp.zeros((4, *grid.shape[:2]), jnp.float32) if surface else None,
     )
 
 

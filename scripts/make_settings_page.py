@@ -1,4 +1,4 @@
-"""Writes docs/settings.md: every setting of `jaxmap map` and `jaxmap train`, from the dataclasses that hold them.
+"""Writes docs/settings.md: every setting of `jaxmap map`, `train` and `plan`, from the dataclasses that hold them.
 
 python scripts/make_settings_page.py
 """
@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal
 import annotated_types
 
 from jaxmap.host import settings
+from jaxmap.planning.options import RoverOptions
 from jaxmap.runs.config import MapConfig
 from jaxmap.runs.training_plan import TrainConfig
 
@@ -144,6 +145,11 @@ def page() -> str:
     """The whole page."""
     parts = [HEAD.strip(), "## jaxmap map", summary(MapConfig), *tables(MapConfig())]
     parts += ["## jaxmap train", summary(TrainConfig), *tables(TrainConfig())]
+    parts += [
+        "## jaxmap plan",
+        f"{summary(RoverOptions)} They are given by `--rover FILE` alone.",
+        *tables(RoverOptions()),
+    ]
     return "\n\n".join(parts) + "\n"
 
 

@@ -21,7 +21,7 @@ FLOORS = (
     # the compiled step, what feeds it, and the map on disk
     "mapping",
     # what is built on maps
-    "evaluation export simulation checks",
+    "evaluation export simulation checks planning",
     "training refinement",
     "tuning",
     "report",

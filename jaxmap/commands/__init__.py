@@ -13,6 +13,7 @@ COMMANDS: dict[str, str] = {
     "merge": "add the maps of several sessions",
     "evaluate": "score a map against a labelled orthomosaic",
     "tune": "tune the fusion parameters against ground truth",
+    "plan": "plan a path over a map, clear of rocks and hazards",
     "segment": "label images with a network and score the labels",
     "simulate": "render a traverse, or training images, of a simulated world",
     "weights": "convert or download pretrained networks",

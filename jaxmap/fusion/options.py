@@ -32,6 +32,8 @@ class FusionRule:
     """Mark voxels that were seen through as free."""
     range_weighting: bool = True
     """Let points count less as depth noise outgrows the voxel."""
+    surface: bool = True
+    """Keep the height of the surface in each column, finer than voxels; hazards are measured from it."""
     column: Literal["max", "sum"] = "sum"
     """Top-down map: the greatest evidence in a column, or the sum of it."""
     priority_classes: tuple[str, ...] | None = None

@@ -24,6 +24,9 @@ LOG_ODDS, AXES = "log_odds", ("channel", "x", "y", "z")
 MEMBERS = "ensemble_log_odds"
 """The members of an ensemble: float32 (M, 2, X, Y, Z), occupancy and the class that is asked about."""
 
+SURFACE = "surface"
+"""Heights of the columns: float32 (4, X, Y), number of points, weight, mean height, and sum of squares about it."""
+
 TILE = (64, 64, 16)
 """Voxels along the edges of a tile, at most: a cube of 3.2 m with the usual voxels. Maps are stored tile by tile."""
 

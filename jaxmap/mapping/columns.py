@@ -164,4 +164,4 @@ def _padded(block: Block, edge: tuple[int, int], margin: int) -> tuple[VoxelMap,
         grid = replace(voxel_map.grid, first=to_device(first, np.int32), shape=(*shape, voxel_map.grid.shape[2]))
         log_odds = jnp.asarray(np.pad(np.asarray(voxel_map.log_odds), edges))
         voxel_map = replace(voxel_map, log_odds=log_odds, grid=grid)
-    return replace(voxel_map, members=None), (own[0], own[1])
+    return replace(voxel_map, members=None, surface=None), (own[0], own[1])

@@ -20,6 +20,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.fusion.integrate import add_evidence
+from jaxmap.fusion.surface import add_heights
 from jaxmap.host.stages import timed_stage
 from jaxmap.mapping.sequence import Cover, FusedFrame, PreparedFrame, run_sequence, timed_frames
 from jaxmap.mapping.step import Mapper, MapperParams, StepReport, check_inputs, compile_step, see_frame, with_step
@@ -82,10 +83,13 @@ def on_devices(mapper: Mapper, devices: Sequence[Device]) -> Mapper:
         check_inputs(design, frame, params)
         frame_key = jax.random.fold_in(key, voxel_map.frames_fused + jax.lax.axis_index(_AXIS))
         seen = see_frame(design, voxel_map.grid, frame, params, frame_key)
-        evidence, first = jax.lax.all_gather((seen.evidence, seen.window.first), _AXIS)
+        evidence, first, heights = jax.lax.all_gather((seen.evidence, seen.window.first, seen.heights), _AXIS)
         fused = voxel_map
         for index in range(len(devices)):
-            fused = add_evidence(fused, evidence[index], replace(seen.window, first=first[index]))
+            window = replace(seen.window, first=first[index])
+            fused = add_evidence(fused, evidence[index], window)
+            if fused.surface is not None and heights is not None:
+                fused = replace(fused, surface=add_heights(fused, heights[index], window))
         fused = replace(fused, frames_fused=voxel_map.frames_fused + batch.used)
         return fused, jax.tree.map(lambda leaf: leaf[None], seen.report)
 

@@ -21,6 +21,7 @@ from jaxmap.fusion.integrate import add_evidence, count_points
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
+from jaxmap.fusion.surface import add_heights, gather_heights, height_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
@@ -96,13 +97,15 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
 class FrameEvidence(NamedTuple):
     """What one frame says, before it is added to a map.
 
-    `evidence` is that of the voxels of `window`; `labels` are those that its points are fused with.
+    `evidence` is that of the voxels of `window`; `labels` are those that its points are fused with;
+    `heights` are the statistics of the columns of the window, where they are kept.
     """
 
     evidence: Float[Array, "C1 X Y Z"]
     window: GridSpec
     labels: PointLabels
     report: StepReport
+    heights: Float[Array, "4 X Y"] | None = None
 
 
 @in_full_float32
@@ -119,6 +122,8 @@ def fuse_frame(
         camera, draws = params.camera, params.ensemble
         own = fuse_members(voxel_map, frame, seen.labels, camera, draws, frame_key, rule, depth_range_m, shape)
         fused = replace(fused, members=own)
+    if voxel_map.surface is not None and seen.heights is not None:
+        fused = replace(fused, surface=add_heights(voxel_map, seen.heights, seen.window))
     return fused, seen.report
 
 
@@ -140,6 +145,11 @@ def see_frame(
     weights = point_weights(grid, cloud, rule)
     counts = count_points(window, cloud.points_world, labels, weights, len(labeller.classes))
 
+    heights = None
+    if rule.surface:
+        sigma_m = height_sigma(cloud, pose.translation()[2])
+        heights = gather_heights(window, cloud.points_world, sigma_m, labels.keep)
+
     hits, freed = _count_voxels(total_weight(counts) > 0, free)
     report = StepReport(
         points_valid=cloud.valid.sum(),
@@ -149,7 +159,7 @@ def see_frame(
         voxels_freed=freed,
         estimate=estimate,
     )
-    return FrameEvidence(frame_evidence(counts, free, fusion, rule), window, labels, report)
+    return FrameEvidence(frame_evidence(counts, free, fusion, rule), window, labels, report, heights)
 
 
 def _count_voxels(
@@ -277,7 +287,7 @@ def make_mapper(
 
     mapper = Mapper(
         design=design,
-        init=lambda: make_voxel_map(grid, labeller.classes, members),
+        init=lambda: make_voxel_map(grid, labeller.classes, members, surface=rule.surface),
         step=fuse,
         fuse=fuse,
         scan=jax.jit(scan),
@@ -353,8 +363,10 @@ class _Tensors(NamedTuple):
 
     log_odds: Array
     members: Array | None
+    surface: Array | None
 
 
 def _apart(voxel_map: VoxelMap) -> tuple[_Tensors, VoxelMap]:
     """The tensors of a map, and the map without them."""
-    return _Tensors(voxel_map.log_odds, voxel_map.members), replace(voxel_map, log_odds=None, members=None)
+    tensors = _Tensors(voxel_map.log_odds, voxel_map.members, voxel_map.surface)
+    return tensors, replace(voxel_map, **dict.fromkeys(_Tensors._fields))

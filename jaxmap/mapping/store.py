@@ -22,6 +22,7 @@ from jaxmap.mapping.arrays import (
     AXES,
     LOG_ODDS,
     MEMBERS,
+    SURFACE,
     StoredArray,
     check_finite,
     check_kind,
@@ -48,7 +49,7 @@ def save_map(path: str | os.PathLike[str], voxel_map: VoxelMap, attributes: MapA
     """
     target = Path(path)
     arrays = _arrays_of(voxel_map, attributes)
-    for name in (LOG_ODDS, MEMBERS):
+    for name in (LOG_ODDS, MEMBERS, SURFACE):
         if name in arrays:
             check_finite(arrays[name].values, target)
     temporary = target.with_name(f".{target.name}.new-{os.getpid()}")
@@ -107,12 +108,17 @@ def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[Vo
         shape = (arrays[MEMBERS].shape[0], 2, *grid.shape)
         ensemble = read_array(arrays, MEMBERS, shape, chunk_counts(stored, target).get(MEMBERS), target)
         check_finite(ensemble, target)
+    surface = None
+    if SURFACE in arrays:
+        surface = read_array(arrays, SURFACE, (4, *grid.shape[:2]), chunk_counts(stored, target).get(SURFACE), target)
+        check_finite(surface, target)
     voxel_map = VoxelMap(
         log_odds=jnp.asarray(log_odds),
         frames_fused=to_device(frames_fused, np.int32),
         grid=grid,
         classes=classes,
         members=None if ensemble is None else jnp.asarray(ensemble),
+        surface=None if surface is None else jnp.asarray(surface),
     )
     return voxel_map, attributes
 
@@ -245,6 +251,8 @@ def _arrays_of(voxel_map: VoxelMap, attributes: MapAttributes) -> dict[str, Stor
     arrays = {LOG_ODDS: StoredArray(np.asarray(voxel_map.log_odds), AXES)}
     if voxel_map.members is not None:
         arrays[MEMBERS] = StoredArray(np.asarray(voxel_map.members), ("member", *AXES))
+    if voxel_map.surface is not None:
+        arrays[SURFACE] = StoredArray(np.asarray(voxel_map.surface), ("channel", *AXES[1:3]))
     for name, values in attributes.layers.items():
         arrays[name] = StoredArray(np.asarray(values, np.float32), ("x", "y"), fill_value=np.nan)
     return arrays

@@ -22,6 +22,7 @@ from jaxmap.mapping.devices import Device, choose_devices, run_on_devices
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame
 from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import MovingBlock, TileStore
+from jaxmap.planning.ground import map_layers
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.checking import finding_line, findings_tree
@@ -323,13 +324,17 @@ def _check_same(plan: Plan, voxel_map: VoxelMap, log: RunLog, where: Path) -> No
 def map_attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap | None = None) -> MapAttributes:
     """What is stored beside the map, which is looked at where it has an ensemble."""
     log.digest = plan.digest(log.next_index)
+    layers = {} if voxel_map is None else named_layers(voxel_map, plan.params.fusion, plan.rule)
+    # Of a part of a larger map, the layers would be no map's.
+    if log.complete and plan.block_shape is None and voxel_map is not None:
+        layers |= map_layers(voxel_map, plan.params.fusion)
     return MapAttributes(
         crs=plan.sequence.crs,
         site_origin=plan.sequence.site_origin,
         T_world_source=plan.sequence.T_world_source,
         fusion=plan.fusion,
         progress=log.as_json(),
-        layers={} if voxel_map is None else named_layers(voxel_map, plan.params.fusion, plan.rule),
+        layers=layers,
     )
 
 

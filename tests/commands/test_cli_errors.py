@@ -97,6 +97,8 @@ def trained(given: Given, fault: str, *words: object) -> list[object]:
     return ["train", data, "--out", given.folder / "run", *(TRAIN_FAULTS[fault][1](data, given.folder) or []), *words]
 
 
+ENDS = ("--start", 0, 0, "--goal", 1, 1)
+
 FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "unknown command": (2, lambda given: ["mapp"]),
     "check: no sequence": (1, lambda given: ["check", given.folder / "nowhere"]),
@@ -110,6 +112,8 @@ FAULTS: dict[str, tuple[int, Callable[[Given], list]]] = {
     "map: out of range": (2, lambda given: mapped(given, "--plane.threshold-m", "-1")),
     "view: no run": (1, lambda given: ["view", given.folder / "nowhere", "--save", given.folder / "f.rrd"]),
     "evaluate: no run": (1, lambda given: ["evaluate", given.folder / "nowhere", given.folder / "truth.tif"]),
+    "plan: no run": (1, lambda given: ["plan", given.folder / "nowhere", *ENDS]),
+    "plan: unknown rover": (2, lambda given: ["plan", given.run, *ENDS, "--rover", "sparrow"]),
     "explain: outside the map": (2, lambda given: ["explain", copied(given), "--at", "-900", "0"]),
     "merge: one run": (2, lambda given: ["merge", given.run, "--out", given.folder / "run"]),
     "export: newer map": (1, lambda given: ["export", newer(given)]),
