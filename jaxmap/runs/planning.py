@@ -26,7 +26,7 @@ from jaxmap.planning.cost import CostMap, cost_map
 from jaxmap.planning.ground import Ground, cell_size, ground_layers, hazards_of, read_ground
 from jaxmap.planning.hazards import Hazards
 from jaxmap.planning.options import RoverOptions
-from jaxmap.planning.path import NoPathError, Terrain, find_path, length_m, sampled, segment_costs, straightened
+from jaxmap.planning.path import NoPathError, Terrain, find_path, length_m, sampled, straightened
 from jaxmap.report.plan_picture import write_plan_picture
 from jaxmap.runs.folder import RunFolder
 from jaxmap.types import VoxelMap
@@ -220,7 +220,8 @@ def _metrics(
     return {
         "length_m": round(length_m(points_m), 3),
         "straight_m": round(straight_m, 3),
-        "cost": round(float(segment_costs(costs.terrain, places_m).sum()), 3),
+        # Of a place between two cells that the path crosses at their corner, a third cell may be the one that counts.
+        "cost": round(float(np.trapezoid(along["cost"], along["distance_m"])), 3),
         "greatest_slope_deg": greatest("slope_deg"),
         "greatest_step_m": greatest("step_m"),
         "greatest_roughness_m": greatest("roughness_m"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,3 +105,16 @@ def test_the_rovers_that_come_along_load():
     assert ROVER_SETTINGS.load("katwijk") == RoverOptions()
     with pytest.raises(UsageError, match="give a YAML file or one of: katwijk"):
         ROVER_SETTINGS.load("no_such_rover")
+
+
+def test_a_path_between_blocked_corners_has_a_cost(run):
+    costs, planned = read_costs(run, RoverOptions()), 0
+    for seed in range(8):
+        drivable = costs.terrain.drivable & (np.random.default_rng(seed).random(costs.terrain.drivable.shape) < 0.8)
+        for end in (place(1.0, 1.0), place(4.5, 4.0)):
+            drivable[tuple(costs.terrain.cell_of(np.array(end) - SITE[:2]))] = True
+        with suppress(JaxmapError):
+            walled = replace(costs, terrain=costs.terrain._replace(drivable=drivable))
+            assert np.isfinite(plan_path(walled, np.array(place(1.0, 1.0)), np.array(place(4.5, 4.0))).metrics["cost"])
+            planned += 1
+    assert planned > 2
