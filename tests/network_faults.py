@@ -169,7 +169,7 @@ SEGMENT_FAULTS: dict[str, tuple[int, Spoil]] = {
     "model of a newer jaxmap": (1, with_record(format_version=2)),
     "model with a damaged record": (1, with_record(holds="nothing")),
     "model of another architecture": (1, with_record(architecture={"backbone": "resnet18"})),
-    "model of an unknown backbone": (1, with_record(architecture={"backbone": "vgg16"})),
+    "model of an unknown backbone": (1, with_record(architecture={"backbone": "vgg19"})),
     "model of an impossible architecture": (1, with_record(architecture={"output_stride": 4, "head_channels": 0})),
     "model with a huge shape": (1, with_header(with_huge_shape)),
     "model of a wrong type": (1, with_header(with_wrong_type)),

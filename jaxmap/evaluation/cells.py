@@ -136,7 +136,7 @@ def _sparse_shares(grid: GridSpec, cells: CellGrid) -> ColumnShares:
 
 def area_in_cells(shares: ColumnShares, columns: Float[AnyArray, "X Y"]) -> Float[Array, "I J"]:
     """The sum over the columns of each cell, weighted by the share of their area that lies in it."""
-    if not isinstance(shares.x, np.ndarray):
+    if hasattr(shares.x, "tocsr"):
         return jnp.asarray(shares.x @ np.asarray(columns, np.float32) @ shares.y.T)
     # The default precision of accelerators would round the counts.
     along_x = jnp.matmul(shares.x, columns, precision="highest")

@@ -16,9 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from jaxmap.errors import FrameError, JaxmapError
-from jaxmap.mapping.arrays import (
-    TILE,
-)
+from jaxmap.mapping.arrays import TILE
 from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import Mapper, MapperParams, StepReport
 from jaxmap.mapping.tiles import Tile, block_shape, tiles_of

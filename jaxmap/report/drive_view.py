@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmap.errors import FrameError, JaxmapError
+from jaxmap.host.bounded_text import parse_json
 from jaxmap.host.pictures import open_picture
 from jaxmap.report.detail import detail_section
 from jaxmap.report.image_colours import SeenFrame, image_colours
@@ -138,12 +139,12 @@ def _map_from_above(contents: RunContents) -> tuple[str, Float[np.ndarray, "3 3"
     """
     try:
         with open_picture(contents.path / "bev.png") as picture:
-            place: dict[str, Any] = json.loads(getattr(picture, "text", {})[PLACE_KEY])
+            place: dict[str, Any] = parse_json(getattr(picture, "text", {})[PLACE_KEY], picture)
             left, top, width, height, west, south, east, north = (float(place[name]) for name in PLACE)
             image = picture.convert("RGB").crop((round(left), round(top), round(left + width), round(top + height)))
         per_m = np.array([width / (east - west), height / (north - south)])
         image.thumbnail((_MAP_WIDTH_PX, _MAP_WIDTH_PX))
-    except (FrameError, OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
+    except (JaxmapError, OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
         return None
     share = image.width / width
     buffer = io.BytesIO()

@@ -25,6 +25,7 @@ import numpy as np
 
 from jaxmap.errors import JaxmapError
 from jaxmap.geometry.bounds import view_boxes
+from jaxmap.host.bounded_text import parse_json
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.executors import Workers, run_tasks
 from jaxmap.mapping.parts import (
@@ -431,7 +432,7 @@ def _planned(run: str) -> Plan:
     """The plan of a run, made once on each worker."""
     if run not in _plans:
         keep_compiled_programs()
-        tree = json.loads(run)
+        tree = parse_json(run, "the task of a worker")
         config = check_config(tree["settings"], "the task of a worker")
         _plans.clear()
         _plans[run] = plan_run(tree["source"], config, lambda line: None, shared=tuple(tree["shape"]))

@@ -13,6 +13,7 @@ from pathlib import Path
 from jaxmap.datasets.base import from_images
 from jaxmap.datasets.registry import SAMPLE_PREFIX
 from jaxmap.errors import JaxmapError, UsageError
+from jaxmap.host.bounded_text import parse_json
 from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.executors import Workers, run_tasks
 from jaxmap.runs.config import PerceiveConfig, absolute_tree, check_perception
@@ -115,7 +116,7 @@ def _planned(run: str) -> Keeper:
     """What perceives, made once on each worker."""
     if run not in _keepers:
         keep_compiled_programs()
-        tree = json.loads(run)
+        tree = parse_json(run, "the task of a worker")
         config = check_perception(tree["settings"], "the task of a worker")
         seen = plan_perception(tree["source"], config, lambda line: None)
         _keepers.clear()

@@ -1,9 +1,11 @@
 """The score of a map as a loss: how far its cells are from the ground truth, differentiable in the evidence.
 
-    loss = nll_weight * NLL + iou_weight * (1 - IoU)
+    loss = nll_weight * NLL + iou_weight * (1 - IoU) + driving_weight * driving cost
 
 NLL is the mean negative log-likelihood of the labelled cells; the soft IoU counts how surely cells are called by the
-class. Cells, areas and truth are those that `jaxmap evaluate` scores (`evaluation.cells`, `evaluation.truth_cells`).
+class; the driving cost is that of a rover that trusts the map: a detour around each cell that is called rock, and for
+each missed rock what it costs to drive over it. Cells, areas and truth are those that `jaxmap evaluate` scores
+(`evaluation.cells`, `evaluation.truth_cells`).
 """
 
 from __future__ import annotations
@@ -53,10 +55,11 @@ class SoftCells(NamedTuple):
 
 
 class LossParts(NamedTuple):
-    """A loss, part by part; `cells` is the number of cells that counted."""
+    """A loss, part by part; `driving_m` is for each cell; `cells` is the number of cells that counted."""
 
     nll: Float[Array, ""]
     soft_iou: Float[Array, ""]
+    driving_m: Float[Array, ""]
     cells: Float[Array, ""]
 
 
@@ -130,8 +133,10 @@ def cells_loss(said: SoftCells, truth: MapTruth, options: MapLossOptions) -> tup
     either = (counted * (said.called + truth.truly - said.called * truth.truly)).sum()
     # Where nothing is of the class and nothing is called so, the two agree.
     soft_iou = (both + _LEAST_PROBABILITY) / (either + _LEAST_PROBABILITY)
-    loss = options.nll_weight * nll + options.iou_weight * (1.0 - soft_iou)
-    return loss, LossParts(nll, soft_iou, counted.sum())
+    paid_m = said.called * options.detour_m + (1.0 - said.called) * truth.truly * options.missed_rock_m
+    driving_m = (counted * paid_m).sum() / jnp.maximum(counted.sum(), 1.0)
+    loss = options.nll_weight * nll + options.iou_weight * (1.0 - soft_iou) + options.driving_weight * driving_m
+    return loss, LossParts(nll, soft_iou, driving_m, counted.sum())
 
 
 def map_loss(

@@ -44,6 +44,13 @@ class MapLossOptions:
     """Weight of rock cells in the likelihood. Above 1 more rocks are found, and probabilities come out too high."""
     iou_weight: Annotated[float, NotNegative] = 1.0
     """Weight of 1 - soft IoU, beside the negative log-likelihood."""
+    driving_weight: Annotated[float, NotNegative] = 0.0
+    """Weight of what the map costs a rover that goes round the cells it calls rock and drives over the others, metres
+    for each cell."""
+    missed_rock_m: Annotated[float, NotNegative] = 10.0
+    """What driving over a missed rock costs, in metres of driving."""
+    detour_m: Annotated[float, NotNegative] = 1.0
+    """What going round a cell costs."""
     rock_fraction: Annotated[float, Interval(gt=0, le=1)] = 0.5
     """A cell is rock where rock covers this share of it."""
     nll_weight: Annotated[float, NotNegative, tyro.conf.Suppress] = 1.0

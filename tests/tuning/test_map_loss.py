@@ -94,11 +94,12 @@ def test_a_list_of_voxels_says_what_its_grid_says(rule):
 
 
 def test_the_loss_is_that_of_its_definition():
-    voxel_map, options = a_map(1), MapLossOptions(nll_weight=0.7, iou_weight=0.4, class_weight=3.0)
+    weighed = dict(driving_weight=0.3, missed_rock_m=8.0, detour_m=2.0)
+    voxel_map, options = a_map(1), MapLossOptions(nll_weight=0.7, iou_weight=0.4, class_weight=3.0, **weighed)
     loss, parts = map_loss(voxel_map, PARAMS, RULES[0], TRUTH, ROCK, options)
     columns = soft_columns_of_map(voxel_map, PARAMS, RULES[0], ROCK, options.softness)
     said = soft_cells(columns, TRUTH.shares, jax.nn.sigmoid(PARAMS.class_prior[ROCK]), options)
-    nll = weights = both = either = 0.0
+    nll = weights = both = either = driving_m = cells = 0.0
     for place in np.ndindex(*TRUTH.truly.shape):
         if not (TRUTH.counted[place] and said.area[place] > 1e-6):
             continue
@@ -107,9 +108,13 @@ def test_the_loss_is_that_of_its_definition():
         weights += 3.0 if truly else 1.0
         both += called * truly
         either += called + truly - called * truly
+        driving_m += called * 2.0 + (1 - called) * truly * 8.0
+        cells += 1
     np.testing.assert_allclose(parts.nll, nll / weights, rtol=1e-4)
     np.testing.assert_allclose(parts.soft_iou, both / either, rtol=1e-4)
-    np.testing.assert_allclose(loss, 0.7 * nll / weights + 0.4 * (1 - both / either), rtol=1e-4)
+    np.testing.assert_allclose(parts.driving_m, driving_m / cells, rtol=1e-4)
+    expected = 0.7 * nll / weights + 0.4 * (1 - both / either) + 0.3 * driving_m / cells
+    np.testing.assert_allclose(loss, expected, rtol=1e-4)
 
 
 def test_a_map_of_the_truth_itself_has_hardly_a_loss_and_its_contrary_a_great_one():
