@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 
 import tyro
+from annotated_types import Interval
 
 from jaxmap.errors import UsageError
 from jaxmap.host.settings import count
@@ -45,6 +46,8 @@ def parse(
 
 Workers = count(1024)
 """The bounds of `--workers`."""
+Coordinate = Annotated[float, Interval(ge=-1e9, le=1e9)]
+"""An east or a north in the coordinate reference system of a map, metres."""
 
 
 def check_workers(workers: int | None, scheduler: str | None) -> None:

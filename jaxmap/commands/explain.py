@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from annotated_types import Interval
 
-from jaxmap.commands.console import Console, check_bounds, parse
+from jaxmap.commands.console import Console, Coordinate, check_bounds, parse
 
 if TYPE_CHECKING:
     import numpy as np
 
     from jaxmap.report.explain_page import Explanation
 
-Place = Annotated[float, Interval(ge=-1e9, le=1e9)]
 _MOST_ROWS = 40
 
 
@@ -31,7 +30,7 @@ class ExplainArguments:
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it; its sequence must still be there."""
-    at: tuple[Place, Place]
+    at: tuple[Coordinate, Coordinate]
     """East and north of the cell, metres in the map's coordinate reference system (x and y where it has none)."""
     radius_m: Annotated[float, Interval(gt=0, le=10)] | None = None
     """All columns of voxels so near along both axes, together, in place of the one at the point."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
-from annotated_types import Interval
 
 from jaxmap.commands.console import Console, Workers, check_bounds, check_workers, parse
 from jaxmap.errors import UsageError
@@ -61,7 +60,7 @@ class MapArguments:
     profile: bool = False
     """Record a trace of ten steps, and of the reading and matching beside them, into profile/ (for Perfetto or
     TensorBoard), and report where the time of a step goes; docs/performance.md explains it."""
-    devices: Annotated[int, Interval(ge=1)] | None = None
+    devices: Annotated[int, Workers] | None = None
     """On how many GPUs frames are fused, one on each at a time; by default on all. A CPU is one device."""
     view: bool = False
     """Show the run in the viewer of rerun while it goes on (pip install 'jaxmap[view]')."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from jaxmap.commands.console import Console, parse
+from jaxmap.commands.console import Console, Coordinate, check_bounds, parse
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class PlanArguments:
 
     run: tyro.conf.Positional[Path]
     """A run folder, as jaxmap map has written it."""
-    start: tuple[float, float]
+    start: tuple[Coordinate, Coordinate]
     """East and north of the start, in the coordinates of the map (bev.tif)."""
-    goal: tuple[float, float]
+    goal: tuple[Coordinate, Coordinate]
     """East and north of the goal."""
     rover: str = "katwijk"
     """YAML file of the rover's size, limits and costs, or the name of one in configs/rovers (katwijk)."""
@@ -35,6 +35,7 @@ class PlanArguments:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     arguments = parse(PlanArguments, "plan", words)
+    check_bounds(arguments, "plan")
 
     import numpy as np
 
