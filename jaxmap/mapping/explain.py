@@ -52,7 +52,7 @@ def make_explainer(design: StepDesign, box: GridSpec, params: MapperParams, key:
         key: of the run.
     """
     x, y, z = (min(pair) for pair in zip(design.window_shape, box.shape, strict=True))
-    design = design._replace(window_shape=(x, y, z), members=0)
+    design = replace(design, window_shape=(x, y, z), members=0)
     empty = make_voxel_map(box, design.labeller.classes)
 
     @jax.jit

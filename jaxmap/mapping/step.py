@@ -62,8 +62,9 @@ class StepReport(NamedTuple):
     estimate: PyTree
 
 
-class StepDesign(NamedTuple):
-    """What is decided before the step is compiled.
+@dataclass(frozen=True, eq=False)
+class StepDesign:
+    """What is decided before the step is compiled; it equals itself alone, and so can be an argument of `jax.jit`.
 
     Attributes:
         labeller: gives each point its class.
@@ -118,7 +119,7 @@ def fuse_frame(
     fused = add_evidence(voxel_map, seen.evidence, seen.window)
     if design.members:
         assert params.ensemble is not None
-        _, rule, depth_range_m, shape, _ = design
+        rule, depth_range_m, shape = design.rule, design.depth_range_m, design.window_shape
         camera, draws = params.camera, params.ensemble
         own = fuse_members(voxel_map, frame, seen.labels, camera, draws, frame_key, rule, depth_range_m, shape)
         fused = replace(fused, members=own)
@@ -132,13 +133,13 @@ def see_frame(
     design: StepDesign, grid: GridSpec, frame: Frame, params: MapperParams, frame_key: PRNGKeyArray
 ) -> FrameEvidence:
     """What a frame says of the voxels of a grid that it can see: all of the step but the sum."""
-    labeller, rule, depth_range_m, shape, _ = design
+    labeller, rule, depth_range_m = design.labeller, design.rule, design.depth_range_m
     camera, pose, fusion = params.camera, frame.T_world_camera, params.fusion
 
     cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
     labels = fusible(labels, labeller.classes, rule)
-    window = view_window(grid, camera, pose, depth_range_m[1], shape)
+    window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
     free = None
     if rule.carve:
         free = carve(camera, pose, cloud.depth_m, cloud.valid, window, fusion, depth_range_m)
