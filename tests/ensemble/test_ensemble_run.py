@@ -53,8 +53,9 @@ def test_the_layer_is_in_every_output(run):
     missed = attributes.layers["missed_rock"]
     assert members_of(run).shape == (MEMBERS, 2, *log_odds(run).shape[1:])
     with rasterio.open(run / "bev.tif") as raster:
-        assert raster.descriptions[-2:] == ("ensemble_probability_rock", "missed_rock")
-        np.testing.assert_array_equal(raster.read(raster.count), missed.T[::-1])
+        assert {"ensemble_probability_rock", "missed_rock"} <= set(raster.descriptions)
+        band = raster.descriptions.index("missed_rock") + 1
+        np.testing.assert_array_equal(raster.read(band), missed.T[::-1])
     ensemble = metrics_of(run)["ensemble"]
     assert ensemble["class"] == "rock" and ensemble["members"] == MEMBERS
     assert 0 < ensemble["missed_area_expected_m2"] < ensemble["observed_area_m2"]
@@ -133,10 +134,9 @@ def test_spreads_that_are_none_are_refused(words, cli, scene_folder, tmp_path):
 
 def test_members_count_against_the_memory(scene_folder):
     little = {"max_memory_gib": 0.005}
-    alone, crowd = (planned(scene_folder, grid=little, ensemble={"members": members}) for members in (0, 20))
-    assert crowd.grid.voxel_size_m[0] > alone.grid.voxel_size_m[0]
+    planned(scene_folder, grid=little)
     with pytest.raises(JaxmapError, match=r"20 members.*fewer --ensemble\.members"):
-        planned(scene_folder, grid={**little, "voxel_size_m": 0.05}, ensemble={"members": 20})
+        planned(scene_folder, grid=little, ensemble={"members": 20})
 
 
 def test_more_frames_leave_the_errors_of_the_others(scene_folder):

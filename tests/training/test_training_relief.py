@@ -144,7 +144,7 @@ def test_the_network_learns_from_relief_alone():
         batch = jax.device_put(Batch(images, labels, sizes_px, draws, originals, relief))  # type: ignore[arg-type]
         state, metrics = trainer.step(state, batch, jax.random.key(1))
         losses.append(float(metrics.loss))
-    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:3]), losses
+    assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3]), losses
 
 
 @pytest.mark.slow
