@@ -143,7 +143,7 @@ def window_of(scene: Scene, size: str) -> GridSpec:
     """The part of the grid that the scene's frame can touch."""
     grid = grid_of(size)
     shape = window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1))
-    return view_window(grid, scene.camera, scene.pose, DEPTH_RANGE_M[1], shape).grid
+    return view_window(grid, scene.camera, scene.pose, DEPTH_RANGE_M[1], shape)
 
 
 def carve_frame(scene: Scene, window: GridSpec) -> Prepared:
@@ -177,7 +177,7 @@ def fuse_frame(scene: Scene, size: str) -> Prepared:
     def fuse(log_odds: jax.Array, rest: VoxelMap, points: Points, pose: jaxlie.SE3) -> jax.Array:
         cloud, voxel_map = points.cloud, replace(rest, log_odds=log_odds)
         window = view_window(grid, scene.camera, pose, DEPTH_RANGE_M[1], shape)
-        free = carve(scene.camera, pose, cloud.depth_m, cloud.valid, grid, params, DEPTH_RANGE_M, window)
+        free = carve(scene.camera, pose, cloud.depth_m, cloud.valid, window, params, DEPTH_RANGE_M)
         weights = point_weights(grid, cloud, RULE)
         return integrate(voxel_map, cloud.points_world, points.labels, weights, params, RULE, window=window, free=free)[
             0
