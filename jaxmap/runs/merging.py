@@ -75,7 +75,7 @@ def _session(run: Path) -> Session:
     reader = open_map(folder.map)
     if reader.attributes.progress.get("complete") is False:
         raise UsageError("the run is not complete", where=run, fix="finish it first: jaxmap map ... --resume")
-    if reader.attributes.layers or "ensemble" in reader.attributes.fusion:
+    if "ensemble" in reader.attributes.fusion:
         raise UsageError(
             "the map has an ensemble, and ensembles of sessions cannot be added: their draws are not the same",
             where=run,
@@ -132,7 +132,7 @@ def _write_map(sessions: Sequence[Session], folder: RunFolder, on_block: Callabl
         store = TileStore(making / folder.map.name, grid, readers[0].classes)
         add_maps(readers, shifts, store, on_block)
         digests = [digest for reader in readers for digest in digests_of(reader)]
-        attributes = replace(readers[0].attributes, progress={"complete": True, "digests": digests})
+        attributes = replace(readers[0].attributes, layers={}, progress={"complete": True, "digests": digests})
         store.commit(sum(reader.frames_fused for reader in readers), attributes)
         store.close()
         os.rename(making / folder.map.name, folder.map)

@@ -80,7 +80,7 @@ def write_map(run: Path, path: np.ndarray) -> None:
 
 def main() -> None:
     """Makes the map and reports on it."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--metres", type=float, default=200.0)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only-report", action="store_true", help="of a map that is there")

@@ -26,6 +26,7 @@ from jaxmap.models.checkpoint import load_network
 MIB = 2**20
 
 
+@pytest.mark.slow
 def test_a_row_of_the_demo(cli, monkeypatch, tmp_path):
     _, config = demo_rows()["plane_chiodini2020"]
     # Labels from files: the quickest step to compile.
@@ -96,6 +97,7 @@ def test_the_sample_is_small_and_whole():
         assert file.crs.to_epsg() == 32631 and set(np.unique(file.read(1))) == {0, 1, 2}
 
 
+@pytest.mark.slow
 def test_the_sample_s_estimated_poses_are_near_the_true_ones():
     sequence = open_sequence("sample:traverse", ReadOptions())
     true = read_poses(sample_truth() / "poses_utm.tum").T

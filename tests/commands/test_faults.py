@@ -95,6 +95,7 @@ def test_reading_a_frame(name, scene_copy, tmp_path):
     check_fault(name, status, read_all, tmp=tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS_FAULTS)
 def test_planning_a_map(name, scene_copy, tmp_path):
     status, damage = SETTINGS_FAULTS[name]
@@ -175,6 +176,7 @@ def test_training_a_batch_that_the_devices_cannot_share(tmp_path, monkeypatch):
     check_fault("train: batch not shared by the devices", 2, lambda: jaxmap.commands.train.main(words), tmp=tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TUNE_FAULTS)
 def test_tuning(name, scene_folder, tmp_path):
     status, damage = TUNE_FAULTS[name]

@@ -19,7 +19,7 @@ from jaxmap.datasets.planetary import T_ENU_SITE
 from jaxmap.datasets.poses import write_tum
 from jaxmap.errors import FrameError, JaxmapError, UsageError
 from jaxmap.runs.config import MapConfig
-from jaxmap.runs.mapping_plan import choose_label_folder
+from jaxmap.runs.labelling import choose_label_folder
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.match import StereoOptions
 

@@ -47,6 +47,7 @@ def refused(folder: Path, options: ReadOptions = ODOMETRY) -> str:
     return str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_poses_stand_upright_above_the_ground_and_go_north(posed):
     T, truth = posed.T_world_camera, scenes.poses(COUNT)
     assert len(posed.frames) == COUNT

@@ -160,6 +160,7 @@ def test_no_spread_makes_numbers_that_are_none(mapper, position_m, disparity_px,
         assert known.size and known.min() >= 0 and known.max() <= 1
 
 
+@pytest.mark.slow
 def test_a_scan_fuses_members_as_a_loop_does(mapper):
     params = MapperParams(CAMERA, FUSION, ensemble=draw_ensemble_params(KEY, FUSION, WIDE))
     errors = draw_pose_errors(KEY, TIMES_S, WIDE)

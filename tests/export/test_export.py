@@ -43,6 +43,7 @@ def as_numpy(top: TopDown) -> TopDown:
     return TopDown(*(np.asarray(leaf) for leaf in top))
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(st.integers(0, 2**31), st.sampled_from([ROVER_CLASSES, ()]))
 def test_occupied_voxels_are_those_of_the_map(seed, classes) -> None:

@@ -65,6 +65,7 @@ def test_sampling_is_the_transpose_of_splatting(kind, grid, rng):
     np.testing.assert_allclose(left, right, atol=1e-4)
 
 
+@pytest.mark.slow
 @kinds()
 @pytest.mark.parametrize("bad", BAD_NUMBERS)
 def test_points_and_values_that_are_no_numbers_are_left_out(kind, bad):
@@ -84,6 +85,7 @@ def test_points_and_values_that_are_no_numbers_are_left_out(kind, bad):
     assert not np.asarray(gradient)[::3].any()
 
 
+@pytest.mark.slow
 @kinds()
 @given(grids(), rngs())
 def test_gradients_to_points_equal_finite_differences(kind, grid, rng):

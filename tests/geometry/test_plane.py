@@ -162,6 +162,7 @@ def test_walls_alone_give_no_plane():
     assert plane.offset_m == 0
 
 
+@pytest.mark.slow
 @given(rngs(), st.sampled_from(COSTS), st.integers(0, 100))
 def test_the_whole_fit_equals_the_twin_given_its_draws(rng, cost, seed):
     points, _, _ = plane_points(rng, noise_m=0.02, outliers=0.4)
@@ -180,6 +181,7 @@ def test_the_whole_fit_equals_the_twin_given_its_draws(rng, cost, seed):
     np.testing.assert_allclose(plane.inlier_fraction, share, atol=1e-2)
 
 
+@pytest.mark.slow
 # The bound is near what the sample allows: the same clouds each time.
 @settings(derandomize=True)
 @given(rngs())

@@ -204,6 +204,7 @@ def soft() -> tuple[Mapper, MapperParams]:
     return mapper_of(make_deeplab_labeller(small_model(), ("rock", "sand"), class_map=RENAMED), FusionRule())
 
 
+@pytest.mark.slow
 def test_the_step_compiles_once_for_a_sequence_and_scan_equals_loop(soft):
     mapper, params = soft
     sequence = [frame_of(image_of(seed), seed) for seed in range(3)]
@@ -235,6 +236,7 @@ def test_the_map_is_updated_in_place_and_no_weight_is_donated_or_built_in(soft):
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves((frame, params)))
 
 
+@pytest.mark.slow
 def test_label_image_shows_what_the_step_gives_the_pixels(soft):
     mapper, params = soft
     shown = np.asarray(mapper.label_image(frame_of(image_of(0)), params, KEY, 0))

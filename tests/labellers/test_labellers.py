@@ -50,6 +50,7 @@ def beach(rng: np.random.Generator) -> np.ndarray:
     return points.astype(np.float32)
 
 
+@pytest.mark.slow
 @given(rngs())
 def test_plane_labels_equal_the_twin(rng):
     points, valid = beach(rng), rng.random(PIXELS) < 0.9
@@ -72,6 +73,7 @@ def test_the_beach_is_sand_and_what_stands_out_is_rock(rng):
     np.testing.assert_array_equal(labels.keep, ~high)
 
 
+@pytest.mark.slow
 @given(rngs())
 def test_a_soft_threshold_goes_to_the_sharp_one(rng):
     points, key = beach(rng), jax.random.key(1)

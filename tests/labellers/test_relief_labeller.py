@@ -239,6 +239,7 @@ def network_labeller() -> Labeller:
     return make_deeplab_labeller(seeing_model())
 
 
+@pytest.mark.slow
 def test_a_network_sees_the_relief_of_the_frame_in_the_step():
     labeller, mapper = mapper_of(network_labeller)
     assert labeller.ground == GroundOptions()

@@ -75,6 +75,7 @@ def test_the_comparison_tells_maps_apart(scene_folder):
         assert_same_map(whole, mapped(planned(scene_folder, stop=1), cpu))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda one: "-".join(map(str, one)) + "-" + one["labeller"])
 def test_the_step_can_be_lowered_for_a_gpu(scene_folder, settings):
     """No operation of it is for CPUs alone: JAX has a lowering of each for CUDA."""

@@ -115,6 +115,7 @@ def test_background_stays_a_class_of_the_image_and_makes_no_voxels(mappers):
     assert not np.asarray(voxel_map.log_odds[1:]).any() and (np.asarray(voxel_map.log_odds[0]) <= 0).all()
 
 
+@pytest.mark.slow
 @given(st.lists(frames(), min_size=2, max_size=3))
 @settings(max_examples=8)
 def test_the_window_of_the_camera_loses_no_point(wide_mapper, sequence):
@@ -166,6 +167,7 @@ def test_compiled_equals_eager(mappers, name):
     assert abs(int(info.voxels_hit) - int(eager_info.voxels_hit)) <= 2
 
 
+@pytest.mark.slow
 def test_a_scan_equals_a_loop_of_steps(plane_mapper):
     sequence = [unlabelled(an_example_frame(seed)) for seed in range(3)]
     looped, infos = plane_mapper.init(), []

@@ -51,6 +51,7 @@ def where(voxel_map, site: np.ndarray, lattice_m: np.ndarray) -> tuple[slice, ..
     return tuple(slice(a, a + n) for a, n in zip(first, voxel_map.grid.shape, strict=True))
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1))
 def test_the_sum_holds_each_map_in_its_place(tmp_path_factory, seed):
     rng, folder = np.random.default_rng(seed), tmp_path_factory.mktemp("merge")

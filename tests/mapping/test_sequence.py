@@ -206,6 +206,7 @@ def test_a_consumer_that_stops_leaves_no_threads():
     assert len(started) <= 4 + 6
 
 
+@pytest.mark.slow
 def test_a_sequence_equals_a_plain_loop_of_steps(scene_folder):
     plan = planned(scene_folder)
     for result, fused in run_sequence(

@@ -93,6 +93,7 @@ def test_a_commit_that_is_cut_off_anywhere_is_carried_out_or_undone(tmp_path, mo
     load_map(store.path)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1))
 def test_a_block_that_moves_gives_the_map_of_the_whole_grid(tmp_path_factory, seed):
     rng, path = np.random.default_rng(seed), tmp_path_factory.mktemp("moves") / "map.zarr"

@@ -98,6 +98,7 @@ def depthwise_gradients(images, kernel, back, stride, dilation, padding):
     return of_images, of_kernel
 
 
+@pytest.mark.slow
 @settings(max_examples=1)
 @given(
     batch=st.integers(1, 3),
@@ -130,6 +131,7 @@ def test_depthwise_gradients_are_the_definition_s(batch, height, width, size, st
         np.testing.assert_allclose(elsewhere, expected_kernel, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_rows_of_several_images_are_summed_together_or_apart():
     axes = (Axis.of(2, 3, 1, 1, "torch"), Axis.of(3, 3, 1, 1, "torch"))
     # The first fits as a block of two images, the second as one image only.
@@ -152,6 +154,7 @@ def test_pointwise_gradients_are_the_definition_s():
         np.testing.assert_allclose(of_images, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_over_a_batch_of_problems_are_those_of_each():
     arrays = normal32(2, 2, 6, 5, 4), normal32(2, 3, 3, 1, 4, seed=1), normal32(2, 1, 1, 4, 5, seed=2)
 
@@ -181,6 +184,7 @@ def by_winograd(images, kernel, dilation):
     return convolve_winograd(images, winograd_kernel(kernel), dilation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("height", "width", "dilation", "batch"), [(1, 1, 3, 1), (6, 7, 2, 2), (9, 4, 1, 1)])
 def test_winograd_s_convolution_is_the_convolution_at_any_size(height, width, dilation, batch):
     images, kernel = normal32(batch, height, width, 5), normal32(3, 3, 5, 4, seed=1)

@@ -40,6 +40,7 @@ def check(backbone: str, stride: int, size: tuple[int, int], folder: Path) -> No
     assert (logits.argmax(axis=-1) == labels).mean() >= 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("backbone", "stride", "size"), QUICK)
 def test_logits_equal_torch(backbone, stride, size, tmp_path):
     check(backbone, stride, size, tmp_path)

@@ -123,6 +123,7 @@ def test_every_kind_fits_every_backbone(kind, backbone):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", OTHERS)
 def test_a_model_file_says_what_it_holds(kind, tmp_path):
     record = replace(small(kind, "mobilenet_v2"), classes=("rock",), top_conv=False)

@@ -124,6 +124,7 @@ def test_the_network_of_a_key_is_always_the_same():
     assert not np.array_equal(one["backbone.stem.kernel"], other["backbone.stem.kernel"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["deeplab", "fcn", "segnet", "unet"])
 def test_classifiers_start_with_logits_on_the_scale_of_the_features(kind):
     record = replace(torch_architecture("mobilenet_v2", CLASSES, kind=kind), top_conv=False)
@@ -141,6 +142,7 @@ ALL_STRIDES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("family", "stride", "backbone"),
     [pytest.param(*case, marks=() if case in QUICK_STRIDES else slow) for case in ALL_STRIDES],

@@ -128,6 +128,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
+@pytest.mark.slow
 def test_wrong_poses_come_back(refined, wrong, scene_folder):
     before, after = (pose_errors(read_poses(path).T, T_TRUE) for path in (wrong, refined / "poses.tum"))
     assert before.position_m.max() == pytest.approx(0.06)

@@ -42,6 +42,7 @@ def mapped(tmp_path_factory, scene_folder, shared_cache, model) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_a_run_says_what_labelled_it(mapped, model):
     sha256 = hashlib.sha256(model.read_bytes()).hexdigest()
     metrics = json.loads((mapped / "metrics.json").read_text())
@@ -53,6 +54,7 @@ def test_a_run_says_what_labelled_it(mapped, model):
     assert model.name in (mapped / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_map_has_the_classes_asked_for_and_evidence_of_each(mapped):
     voxel_map, _ = load_map(mapped / "map.zarr")
     assert voxel_map.classes == ("rock", "sand")

@@ -161,6 +161,7 @@ def test_norms_train_as_the_options_say(norm, expected):
     assert start_of(saved(holds="backbone"), **norm).batch_norms == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "name"), [("fcn", "FCN-8s"), ("segnet", "SegNet"), ("unet", "U-Net")])
 def test_of_another_kind_of_network_the_backbone_alone_is_kept(kind, name):
     tf = replace(tf_architecture("mobilenet_v2", CLASSES), head_channels=8, low_level_channels=4)

@@ -165,6 +165,7 @@ def test_disturbed_relief_stays_unknown_where_it_was(seed):
     assert (np.abs(error[..., :-1]) < 0.3 * 6).all() and (error[..., -1] == 0).all()
 
 
+@pytest.mark.slow
 def test_either_input_is_dropped_but_not_both():
     image = np.full((*STORED_PX, 3), 90, np.uint8)
     known, unknown = np.ones((5, 6, 3), np.float32), np.zeros((5, 6, 3), np.float32)
@@ -266,6 +267,7 @@ def test_the_whole_window_shows_the_whole_image_in_the_middle(size_px, crop_px):
     assert not bool(view.mirrored)
 
 
+@pytest.mark.slow
 @given(sizes, seeds, st.sampled_from([fast_draw, around_draw]))
 def test_a_drawn_view_lies_on_its_image_or_the_image_in_it(size_px, seed, draw):
     view = draw(jax.random.key(seed), example(size_px, seed)[1], jnp.array(size_px))

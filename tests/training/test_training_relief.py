@@ -61,6 +61,7 @@ def opened(folder: Path) -> TrainingSet:
     return with_stereo(open_training_set(folder, CLASSES))
 
 
+@pytest.mark.slow
 def test_the_relief_of_an_image_is_that_of_its_disparity(data):
     training_set = opened(data)
     first, second = training_set.train[:2]
@@ -128,6 +129,7 @@ def test_a_camera_that_is_none_is_refused(copy, content, reason):
         read_stereo(copy, NAME)
 
 
+@pytest.mark.slow
 def test_the_network_learns_from_relief_alone():
     """The images are all alike; the labels stand in the relief."""
     record = replace(ARCHITECTURE, decoder=True, relief_channels=2)

@@ -199,6 +199,7 @@ def test_no_time_is_counted_twice(plan, tmp_path):
 # --- interrupted and resumed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [1, 4, STEPS])
 def test_a_cut_run_ends_as_if_it_had_not_been_cut(step, plan, whole_run, tmp_path):
     run = tmp_path / "run"

@@ -195,6 +195,7 @@ def test_dropout_differs_from_step_to_step(frozen):
     assert frozen.step(again, batch_of())[1].loss == one.loss
 
 
+@pytest.mark.slow
 def test_the_loss_of_a_step_is_that_of_its_examples(learning):
     batch = batch_of(False)
     augment_key, dropout_key = jax.random.split(jax.random.key(5))

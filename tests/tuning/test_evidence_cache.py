@@ -90,6 +90,7 @@ SOFT_FIRST = [pytest.param(name, marks=[] if name == "soft" else [pytest.mark.sl
 NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in LABELLERS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("rule", RULES)
 def test_it_fuses_what_the_mapper_fuses(name, rule):
@@ -113,6 +114,7 @@ def test_it_fuses_what_the_mapper_fuses(name, rule):
     assert not np.asarray(ours.log_odds)[:, ~hit].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_keeping_blocks_of_points_as_one_hardly_changes_the_evidence(name):
     labeller = LABELLERS[name]

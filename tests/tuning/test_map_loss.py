@@ -146,6 +146,7 @@ def loss_of(params: FusionParams, log_odds: jax.Array, truth: MapTruth, rule: Fu
 slopes = jax.jit(jax.grad(loss_of, argnums=(0, 1)), static_argnums=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", SOME_RULES)
 @given(seed=st.integers(0, 2**16))
 @settings(max_examples=8, deadline=None)

@@ -111,6 +111,7 @@ def test_it_is_the_gradient_through_the_scan(name, frames):
     assert any(np.asarray(leaf).any() for leaf in jax.tree.leaves(gradient.fusion))
 
 
+@pytest.mark.slow
 @given(frames=scene_frames(), order=st.permutations(range(3)))
 @settings(max_examples=5)
 def test_the_order_of_the_frames_does_not_matter(frames, order):
