@@ -136,11 +136,12 @@ def _sparse_shares(grid: GridSpec, cells: CellGrid) -> ColumnShares:
 
 def area_in_cells(shares: ColumnShares, columns: Float[AnyArray, "X Y"]) -> Float[Array, "I J"]:
     """The sum over the columns of each cell, weighted by the share of their area that lies in it."""
-    if hasattr(shares.x, "tocsr"):
-        return jnp.asarray(shares.x @ np.asarray(columns, np.float32) @ shares.y.T)
+    x, y = shares.x, shares.y
+    # Arrays may be JAX's, also traced ones.
+    if not isinstance(x, AnyArray) or not isinstance(y, AnyArray):
+        return jnp.asarray(x @ np.asarray(columns, np.float32) @ y.T)
     # The default precision of accelerators would round the counts.
-    along_x = jnp.matmul(shares.x, columns, precision="highest")
-    return jnp.matmul(along_x, shares.y.T, precision="highest")
+    return jnp.matmul(jnp.matmul(x, columns, precision="highest"), y.T, precision="highest")
 
 
 def map_cells(
