@@ -308,9 +308,14 @@ def keep_frames(keeper: Keeper, folder: RunFolder, indices: Sequence[int]) -> It
     """
     for prepared in keeper.frames(folder.observations, indices):
         if prepared.frame is not None and prepared.index in keeper.seen.key_frames:
-            assert prepared.rectified is not None
+            rectified = prepared.rectified
+            if rectified is None or not rectified.left.size:
+                # Kept by a process that was killed before it drew the picture.
+                seen = keeper.seen
+                pair = seen.sequence.read_pair(seen.sequence.frames[prepared.index])
+                rectified = seen.front_end(pair.left, pair.right)
             # At full size: maps draw their own pictures, of any size, from these.
-            write_key_frame(folder, prepared.index, prepared.rectified, None, (), large=True)
+            write_key_frame(folder, prepared.index, rectified, None, (), large=True)
         yield KeptFrame(prepared.ref.name, prepared.fault, prepared.stages_s)
 
 

@@ -24,8 +24,11 @@ from jaxmap.datasets.poses import write_tum
 from jaxmap.ensemble.options import EnsembleOptions
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.mapping.observations import open_observations
-from jaxmap.runs.config import config_of_observations
+from jaxmap.runs.config import PerceiveConfig, config_of_observations
+from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping_plan import Plan, plan_run
+from jaxmap.runs.perceiving import keep_frames, make_keeper
+from jaxmap.runs.perception import plan_perception
 
 PLANE = ("--labeller", "plane")
 
@@ -274,3 +277,13 @@ def test_a_network_sees_each_frame_once_and_tuned_numbers_still_act(cli, scene_f
     assert np.abs(log_odds(tmp_path / "softer") - log_odds(tmp_path / "fused")).max() > 0.05
     refused = cli(*map_words(tmp_path / "kept", tmp_path / "refused", *network, "--deeplab.size-px", 64, 64))
     assert "perceived with another deeplab.size_px" in refused.error
+
+
+def test_a_picture_that_a_killed_process_has_not_drawn_is_drawn_with_the_next_try(copy, scene_folder):
+    config = PerceiveConfig(labeller="plane")
+    keeper = make_keeper(plan_perception(str(scene_folder), config, lambda line: None), config, 0.5)
+    picture = copy / "pictures" / "000001_left.png"
+    drawn = picture.read_bytes()
+    picture.unlink()
+    assert [kept.fault for kept in keep_frames(keeper, RunFolder(copy), [1])] == [None]
+    assert picture.read_bytes() == drawn
