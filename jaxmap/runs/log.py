@@ -127,8 +127,6 @@ class RunLog:
     too_near: Count = 0
     nearest_px: Number = 0.0
     disparity: dict[str, Sample] = field(default_factory=dict)
-    too_near: Count = 0
-    nearest_px: Number = 0.0
     total_s: Seconds = 0.0
     compile_s: Seconds = 0.0
     temporary_bytes: Count = 0
