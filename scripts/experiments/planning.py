@@ -37,7 +37,7 @@ from jaxmap.runs.planning import Costs, costs_of, plan_path
 from jaxmap.types import GridSpec
 
 LEAST_ROCK_M, LEAST_APART_M, IN_VIEW, ROCK_LABEL = 0.3, 3.0, 0.2, 2
-RENDERING = ("--frames", 10, "--width", 640, "--samples", 4, "--map-cell-m", 0.05)
+RENDERING = ("--frames", 10, "--samples", 4, "--map-cell-m", 0.05)
 BASE = MapConfig()
 NETWORK = replace(BASE, labeller="deeplab", relief=replace(BASE.relief, combine=False))
 SEEN_BY = {
