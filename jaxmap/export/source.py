@@ -205,7 +205,7 @@ class Source:
             x, y = (start - (side[0] - low) for start, side, low in zip(corner, sides, lows, strict=True))
             width, depth = top.observed.shape
             place = (slice(x, x + width), slice(y, y + depth))
-            layers = {name: values[place] for name, values in self.reader.attributes.layers.items()}
+            layers = self.reader.layers(place)
             inner = tuple(slice(low - a, high - a) for a, (low, high) in zip(lows, sides, strict=True))
             yield Columns((x, y), top, layers, (inner[0], inner[1]))
 

@@ -99,14 +99,14 @@ class FrameEvidence(NamedTuple):
     """What one frame says, before it is added to a map.
 
     `evidence` is that of the voxels of `window`; `labels` are those that its points are fused with;
-    `heights` are the statistics of the columns of the window, where they are kept.
+    `heights` are the statistics of its columns, where they are kept.
     """
 
     evidence: Float[Array, "C1 X Y Z"]
     window: GridSpec
     labels: PointLabels
     report: StepReport
-    heights: Float[Array, "4 X Y"] | None = None
+    heights: Float[Array, "4 X Y L"] | None = None
 
 
 @in_full_float32
@@ -149,7 +149,7 @@ def see_frame(
     heights = None
     if rule.surface:
         sigma_m = height_sigma(cloud, pose.translation()[2])
-        heights = gather_heights(window, cloud.points_world, sigma_m, labels.keep)
+        heights = gather_heights(grid, window, cloud.points_world, sigma_m, labels.keep)
 
     hits, freed = _count_voxels(total_weight(counts) > 0, free)
     report = StepReport(

@@ -22,9 +22,11 @@ from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.merge import add_maps, check_alike, common_grid, digests_of
 from jaxmap.mapping.store import MapReader, open_map
 from jaxmap.mapping.tiles import TileStore
+from jaxmap.planning.options import RoverOptions
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.exports import write_exports
 from jaxmap.runs.folder import RunFolder, count_voxels, write_poses
+from jaxmap.runs.hazard_layers import add_hazards
 
 _PICTURE = re.compile(r"(?P<frame>\d{6})_(?P<kind>left|disparity|labels)\.(?P<ending>png|webp)")
 _PAUSE_S = 1.0
@@ -92,13 +94,17 @@ def settings_of(sessions: Sequence[Session]) -> dict[str, Any]:
 
 
 def merge_sessions(
-    sessions: Sequence[Session], folder: RunFolder, on_block: Callable[[int], object] = lambda done: None
+    sessions: Sequence[Session],
+    folder: RunFolder,
+    rover: RoverOptions,
+    on_block: Callable[[int], object] = lambda done: None,
 ) -> list[str]:
     """Writes the run that all sessions make.
 
     Args:
         sessions: of `open_sessions`.
         folder: where it goes; `RunFolder.begin` was called.
+        rover: whose hazards are layers of the map.
         on_block: is told how many blocks of the maps were added.
 
     Returns:
@@ -107,7 +113,7 @@ def merge_sessions(
     Raises:
         JaxmapError: a map is damaged, the lattices do not agree, or an output cannot be written.
     """
-    _write_map(sessions, folder, on_block)
+    _write_map(sessions, folder, rover, on_block)
     reader = open_map(folder.map)
     notes = _write_poses(sessions, folder)
     if reader.attributes.crs is None:
@@ -122,19 +128,23 @@ def merge_sessions(
     return notes
 
 
-def _write_map(sessions: Sequence[Session], folder: RunFolder, on_block: Callable[[int], object]) -> None:
+def _write_map(
+    sessions: Sequence[Session], folder: RunFolder, rover: RoverOptions, on_block: Callable[[int], object]
+) -> None:
     """The map is made in a folder of its own, and put in its place when it is whole."""
     readers = [session.reader for session in sessions]
     grid, shifts = common_grid(readers, [session.folder.path for session in sessions])
     making = folder.path / ".merging"
     try:
         shutil.rmtree(making, ignore_errors=True)
-        store = TileStore(making / folder.map.name, grid, readers[0].classes)
+        surface = all(reader.surface for reader in readers)
+        store = TileStore(making / folder.map.name, grid, readers[0].classes, surface=surface)
         add_maps(readers, shifts, store, on_block)
         digests = [digest for reader in readers for digest in digests_of(reader)]
         attributes = replace(readers[0].attributes, layers={}, progress={"complete": True, "digests": digests})
         store.commit(sum(reader.frames_fused for reader in readers), attributes)
         store.close()
+        add_hazards(making / folder.map.name, rover)
         os.rename(making / folder.map.name, folder.map)
         sync(folder.path)
     except OSError as error:

@@ -29,11 +29,11 @@ from jaxmap.errors import JaxmapError
 from jaxmap.fusion.surface import Surface
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.mapping.store import MapAttributes
-from jaxmap.planning.ground import Ground, read_ground
+from jaxmap.planning.ground import Ground
 from jaxmap.planning.options import RoverOptions
 from jaxmap.runs.config import MapConfig
 from jaxmap.runs.mapping_plan import Plan
-from jaxmap.runs.planning import Costs, costs_of, plan_path
+from jaxmap.runs.planning import Costs, costs_of, plan_path, read_site
 from jaxmap.types import GridSpec
 
 LEAST_ROCK_M, LEAST_APART_M, IN_VIEW, ROCK_LABEL = 0.3, 3.0, 0.2, 2
@@ -125,16 +125,16 @@ def ways(frames: Frames, rover: RoverOptions, world: Traverse) -> tuple[dict[str
         plan = frames.plan(config)
         voxel_map = fuse(plan, frames.prepared)
         attributes = MapAttributes(plan.sequence.crs, plan.sequence.site_origin)
-        rock = plan.rule.target(voxel_map.classes)
-        ground = read_ground(voxel_map, plan.params.fusion, plan.rule, rock)
+        reader = in_memory(voxel_map, attributes)
+        site, ground = read_site(reader, plan.params.fusion, plan.rule, reader.whole)
         if not seen_by:
-            seen_by["truth"] = costs_of(voxel_map, attributes, truth.ground, rover, "rock")
+            seen_by["truth"] = costs_of(replace(site, rock="rock"), truth.ground, rover)
         if name == "ours":
             blind = ground._replace(rock_probability=np.zeros_like(ground.rock_probability))
-            seen_by["hazards"] = costs_of(voxel_map, attributes, blind, rover, rock)
+            seen_by["hazards"] = costs_of(site, blind, rover)
         else:
             ground = ground._replace(surface=ground.surface._replace(known=np.zeros_like(ground.seen)))
-        seen_by[name] = costs_of(voxel_map, attributes, ground, rover, rock)
+        seen_by[name] = costs_of(site, ground, rover)
     cell_m = seen_by["truth"].terrain.cell_m
     far_m = np.full(truth.large_rock.shape, np.inf)
     if truth.large_rock.any():
