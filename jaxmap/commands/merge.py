@@ -11,7 +11,10 @@ import tyro
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
 
-OUTPUTS = ("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "config.yaml", "poses.tum")
+OUTPUTS = (
+    *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
+    *("config.yaml", "poses.tum", "frames.csv"),
+)
 
 
 @dataclass(frozen=True)

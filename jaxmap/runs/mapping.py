@@ -32,7 +32,7 @@ from jaxmap.runs.hazard_layers import add_hazards
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Plan
-from jaxmap.runs.run_frames import write_frame_table
+from jaxmap.runs.run_frames import rows_of, write_frame_table
 from jaxmap.types import VoxelMap
 
 _PICTURES_AT_ONCE = 4
@@ -279,7 +279,7 @@ def write_outputs(
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
-    write_frame_table(folder.frames, plan.sequence.frames, skipped)
+    write_frame_table(folder.frames, rows_of(plan.sequence.frames, skipped))
     write_exports(folder, reader)
     metrics = _metrics(plan, log, reader) | count_missed(plan.rule, reader, plan.members) | details
     write_json(folder.metrics, metrics)

@@ -20,7 +20,7 @@ from jaxmap.report.first_seen import first_seen
 from jaxmap.report.recording import check_viewer, recording
 from jaxmap.report.run_contents import read_run
 from jaxmap.runs.folder import RunFolder
-from jaxmap.runs.run_frames import read_run_frames, write_frame_table
+from jaxmap.runs.run_frames import read_run_frames, rows_of, write_frame_table
 from jaxmap.types import Pinhole
 
 CAMERA, SIZE_PX = Pinhole(50.0, 50.0, 31.5, 23.5, 0.1, 0.0), (64, 48)
@@ -45,11 +45,11 @@ def run(tmp_path) -> Path:
     local = T - np.pad(SITE[:, None], ((0, 1), (3, 0)))
     metrics["camera"]["key_frames"] = {"000000": local[0].tolist(), "000020": local[-1].tolist()}
     (run / "metrics.json").write_text(json.dumps(metrics))
-    write_frame_table(run / "frames.csv", frame_names(21), {"left, 19": 'it is "black"'})
+    write_frame_table(run / "frames.csv", rows_of(frame_names(21), {"left, 19": 'it is "black"'}))
     return run
 
 
-def rows_of(path: Path) -> dict[str, list[dict]]:
+def logged(path: Path) -> dict[str, list[dict]]:
     """The rows of each entity of a recording, as rerun reads them."""
     reader = pytest.importorskip("rerun.chunk").RrdReader(path)
     assert len(reader.recordings()) == 1 and len(reader.blueprints()) == 1
@@ -106,7 +106,7 @@ def test_a_run_becomes_a_recording(cli, run, tmp_path) -> None:
     outcome = cli("view", run, "--save", tmp_path / "f.rrd")
     assert outcome.status == 0, outcome.err
     assert "20 poses; pictures (left, labels, disparity) of 2 key frames" in outcome.err
-    rows = rows_of(tmp_path / "f.rrd")
+    rows = logged(tmp_path / "f.rrd")
     poses = sorted((row["frame"], row["Transform3D:translation"][0]) for row in rows["/world/camera"])
     assert [frame for frame, _ in poses] == [*range(19), 20]
     np.testing.assert_allclose(poses[0][1], [-3, 0, 1.2], atol=1e-5)
@@ -134,7 +134,7 @@ def test_a_run_from_before_says_what_it_shows(cli, run, tmp_path) -> None:
     pytest.importorskip("rerun")
     (run / "frames.csv").unlink()
     assert cli("view", run, "--save", tmp_path / "f.rrd").status == 0
-    pictures = rows_of(tmp_path / "f.rrd")["/labels"]
+    pictures = logged(tmp_path / "f.rrd")["/labels"]
     assert sorted({row["frame"] for row in pictures}) == [0, 19], "by where they were taken"
     metrics = json.loads((run / "metrics.json").read_text())
     del metrics["camera"]
@@ -143,7 +143,7 @@ def test_a_run_from_before_says_what_it_shows(cli, run, tmp_path) -> None:
     assert outcome.status == 0, outcome.err
     for remark in ("no frames.csv", "metrics.json does not tell the camera", "all from the first frame on"):
         assert remark in outcome.err
-    assert [name for name in rows_of(tmp_path / "f.rrd") if name.startswith("/world/voxels/")] == [
+    assert [name for name in logged(tmp_path / "f.rrd") if name.startswith("/world/voxels/")] == [
         "/world/voxels/000000"
     ]
 
@@ -175,7 +175,7 @@ def test_what_is_interrupted_leaves_a_file_and_what_fails_none(tmp_path) -> None
             raise fault
 
     record(tmp_path / "stopped.rrd", KeyboardInterrupt())
-    assert rows_of(tmp_path / "stopped.rrd")["/world/camera"][0]["frame"] == 3
+    assert logged(tmp_path / "stopped.rrd")["/world/camera"][0]["frame"] == 3
     record(tmp_path / "failed.rrd", ValueError())
     assert [path.name for path in tmp_path.iterdir()] == ["stopped.rrd"]
 
@@ -185,7 +185,7 @@ def test_a_run_is_recorded_while_it_goes_on(cli, scene_folder, tmp_path) -> None
     pytest.importorskip("rerun")
     outcome = cli(*map_words(scene_folder, tmp_path / "run", "--view-save", tmp_path / "live.rrd"))
     assert outcome.status == 0, outcome.err
-    rows = rows_of(tmp_path / "live.rrd")
+    rows = logged(tmp_path / "live.rrd")
     assert sorted(row["frame"] for row in rows["/world/camera"]) == [*range(6)]
     assert len(rows["/disparity"]) == len(rows["/labels"]) == 6
     last = max(rows["/world/voxels/map"], key=lambda row: row["frame"])
