@@ -169,7 +169,7 @@ def test_what_is_interrupted_leaves_a_file_and_what_fails_none(tmp_path) -> None
     pytest.importorskip("rerun")
 
     def record(path: Path, fault: BaseException) -> None:
-        with pytest.raises(type(fault)), recording("name", ("sand",), path) as log:
+        with pytest.raises(type(fault)), recording("name", ("sand",), np.zeros((1, 3)), path) as log:
             log.at(3, 2.0)
             log.pose(np.eye(4))
             raise fault
