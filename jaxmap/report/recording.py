@@ -22,8 +22,8 @@ from jaxmap.types import Pinhole
 
 PICTURE_PX = 640
 """Width of the pictures that are logged."""
-_AWAY_M = 6.0
-"""How far beyond the ends of the drive the eye is."""
+_AHEAD_M, _AWAY_M = 4.0, 5.0
+"""So far before the camera its ground begins to be the map; how much farther than that is wide the eye is away."""
 _SINCE_1970_S = 1e8
 """Smaller times count from some start of their own."""
 _SHOWN = {"left": "Left image", "labels": "Labels", "disparity": "Disparity"}
@@ -129,7 +129,7 @@ class Recording:
 
 @contextmanager
 def recording(
-    name: str, classes: Sequence[str], positions: Float[np.ndarray, "N 3"], save: Path | None
+    name: str, classes: Sequence[str], T_world_camera: Float64[np.ndarray, "N 4 4"], save: Path | None
 ) -> Iterator[Recording]:
     """A recording that streams into a viewer, which is started, or into a file, which is there when the block ends.
 
@@ -138,13 +138,13 @@ def recording(
     Args:
         name: of what is shown.
         classes: of the map.
-        positions: of the camera; at first one looks at their middle.
+        T_world_camera: of all frames; at first one sees what they looked at.
         save: the file, or None for a viewer.
 
     Raises:
         JaxmapError: what `check_viewer` refuses, or the file cannot be written.
     """
-    rr, layout = check_viewer(save), _layout(np.asarray(positions, np.float64))
+    rr, layout = check_viewer(save), _layout(T_world_camera)
     if save is None:
         with rr.RecordingStream("jaxmap") as stream:
             stream.spawn(default_blueprint=layout)
@@ -184,12 +184,14 @@ def check_viewer(save: Path | None) -> Any:
     return rr
 
 
-def _layout(positions: Float64[np.ndarray, "N 3"]) -> Any:
+def _layout(T_world_camera: Float64[np.ndarray, "N 4 4"]) -> Any:
     """The world from above the drive, beside the pictures; the time line counts frames, and begins at the last."""
     blueprint = importlib.import_module("rerun.blueprint")
     places = {"left": "world/camera/left", "labels": "labels", "disparity": "disparity"}
     pictures = [blueprint.Spatial2DView(origin=place, name=_SHOWN[kind]) for kind, place in places.items()]
-    low, high = positions.min(axis=0), positions.max(axis=0)
+    positions, ahead = T_world_camera[:, :3, 3], T_world_camera[:, :3, 2]
+    seen = np.concatenate([positions, positions + _AHEAD_M * ahead])
+    low, high = seen.min(axis=0), seen.max(axis=0)
     middle, away_m = (low + high) / 2, _AWAY_M + float(np.linalg.norm(high - low))
     eye = blueprint.EyeControls3D(
         kind=blueprint.Eye3DKind.Orbital,

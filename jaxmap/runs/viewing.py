@@ -45,9 +45,8 @@ def view_run(run: Path, save: Path | None) -> list[str]:
     folder = RunFolder(run)
     contents = read_run(run)
     frames = read_run_frames(folder, contents.attributes.site_origin)
-    positions = frames.T_world_camera[:, :3, 3]
-    with recording(contents.name, contents.classes, positions, save) as log:
-        log.path(positions)
+    with recording(contents.name, contents.classes, frames.T_world_camera, save) as log:
+        log.path(frames.T_world_camera[:, :3, 3])
         for frame, T, timestamp_s in zip(frames.index, frames.T_world_camera, frames.timestamps_s, strict=True):
             log.at(int(frame), float(timestamp_s))
             log.pose(T)
@@ -158,7 +157,7 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
     """
     camera, T_world_camera = plan.front_end.camera, plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified
     classes, last, shown_s = plan.labeller.classes, len(plan.sequence.frames) - 1, -np.inf
-    with recording(plan.sequence.name, classes, T_world_camera[:, :3, 3], save) as log:
+    with recording(plan.sequence.name, classes, T_world_camera, save) as log:
 
         def show(fused: FusedFrame, voxel_map: VoxelMap) -> None:
             nonlocal shown_s

@@ -13,9 +13,13 @@ from truth_files import SITE, write_map
 
 from jaxmap.commands.main import main
 from jaxmap.datasets.poses import read_poses
-from jaxmap.mapping.store import load_map, save_map
+from jaxmap.fusion.surface import over_layers
+from jaxmap.mapping.store import load_map, open_map, save_map
+from jaxmap.planning.options import RoverOptions
+from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.merging import open_sessions
-from jaxmap.runs.run_frames import read_frame_table
+from jaxmap.runs.planning import read_costs
+from jaxmap.runs.run_frames import read_frame_table, read_run_frames
 
 SEEN = np.ones((20, 12), bool)
 CAMERA = {"fx_px": 60, "fy_px": 60, "cx_px": 39.5, "cy_px": 29.5, "width_px": 80, "height_px": 60}
@@ -91,7 +95,10 @@ def test_halves_of_a_sequence_merged_are_the_whole(cli, scene_folder, tmp_path):
     merged_run = RunFolder(tmp_path / "merged")
     assert read_run_frames(merged_run, np.zeros(3)).index.tolist() == list(range(6))
     assert_same_hazards(tmp_path / "merged" / "map.zarr", tmp_path / "whole" / "map.zarr")
-    for words in (("report",), ("view", "--save", tmp_path / "f.rrd"), ("plan", *ENDS)):
+    ours, theirs = (read_costs(tmp_path / name, RoverOptions()) for name in ("merged", "whole"))
+    assert ours.site.fine and np.isfinite(theirs.hazards.slope_deg).any()
+    np.testing.assert_allclose(ours.hazards.slope_deg[part[:2]], theirs.hazards.slope_deg, rtol=1e-2, atol=1e-2)
+    for words in (("report",), ("view", "--save", tmp_path / "f.rrd")):
         outcome = cli(words[0], tmp_path / "merged", *words[1:])
         assert outcome.status == 0, outcome.err
 
@@ -108,7 +115,6 @@ def assert_same_hazards(found: Path, expected: Path) -> None:
 
 
 def test_times_that_overlap_are_told(runs, tmp_path):
-    from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.merging import _write_poses
 
     write_run(tmp_path / "c", 100.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import json
 from pathlib import Path
 
@@ -12,10 +13,13 @@ from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_runs import SITE, add_cameras, make_run
+from PIL import Image
 
 from jaxmap.datasets.base import FrameRef
 from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.errors import JaxmapError
+from jaxmap.labels import class_colours
+from jaxmap.mapping.observations import Observation, ObservationAttributes, write_attributes, write_observation
 from jaxmap.report.first_seen import first_seen
 from jaxmap.report.recording import check_viewer, recording
 from jaxmap.report.run_contents import read_run
@@ -23,6 +27,7 @@ from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.run_frames import read_run_frames, rows_of, write_frame_table
 from jaxmap.types import Pinhole
 
+SMALL = dict(fx_px=30.0, fy_px=30.0, cx_px=19.5, cy_px=14.5, baseline_m=0.3, width_px=40.0, height_px=30.0)
 CAMERA, SIZE_PX = Pinhole(50.0, 50.0, 31.5, 23.5, 0.1, 0.0), (64, 48)
 
 
@@ -130,6 +135,32 @@ def test_a_run_becomes_a_recording(cli, run, tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_frames_between_key_frames_show_what_was_perceived(cli, run, tmp_path) -> None:
+    pytest.importorskip("rerun")
+    # In the order of the classes that are kept, which is not the map's.
+    kept = ObservationAttributes(
+        "s", "s", "folder", dict(SMALL), {}, "files", "labels", (30, 40), ("rock", "other", "sand")
+    )
+    write_attributes(run / "observations.zarr", kept)
+    disparity_px, labels = np.full((30, 40), 5.0, np.float32), np.zeros((30, 40), np.uint8)
+    labels[:, 20:] = 255
+    for name, time_s in (("left, 0", 100.0), ("left, 7", 107.0), ("left, 9", 109.0)):
+        seen = Observation(name, time_s, np.eye(4), disparity_px, labels)
+        write_observation(run / "observations.zarr", seen, "labels")
+    outcome = cli("view", run, "--save", tmp_path / "f.rrd")
+    assert outcome.status == 0, outcome.err
+    assert "disparity and likeliest classes of 2 other frames" in outcome.err
+    rows = logged(tmp_path / "f.rrd")
+    for entity in ("/labels", "/disparity"):
+        assert sorted({row["frame"] for row in rows[entity] if row.get("EncodedImage:blob")}) == [0, 7, 9, 20]
+    assert {row["frame"] for row in rows["/world/camera/left"] if "Clear:is_recursive" in row} == {7, 9}
+    [blob] = next(row["EncodedImage:blob"] for row in rows["/labels"] if row["frame"] == 7)
+    picture = np.asarray(Image.open(io.BytesIO(bytes(blob))).convert("RGB"), int)
+    rock = class_colours(read_run(run).classes)[read_run(run).classes.index("rock")]
+    assert np.abs(picture[10, 5] - rock).max() < 12 and picture[10, 35].max() < 12
+
+
+@pytest.mark.slow
 def test_a_run_from_before_says_what_it_shows(cli, run, tmp_path) -> None:
     pytest.importorskip("rerun")
     (run / "frames.csv").unlink()
@@ -169,7 +200,7 @@ def test_what_is_interrupted_leaves_a_file_and_what_fails_none(tmp_path) -> None
     pytest.importorskip("rerun")
 
     def record(path: Path, fault: BaseException) -> None:
-        with pytest.raises(type(fault)), recording("name", ("sand",), np.zeros((1, 3)), path) as log:
+        with pytest.raises(type(fault)), recording("name", ("sand",), np.eye(4)[None], path) as log:
             log.at(3, 2.0)
             log.pose(np.eye(4))
             raise fault
