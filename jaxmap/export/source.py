@@ -44,7 +44,7 @@ class TopDownPart(NamedTuple):
 
     corner: tuple[int, int]
     top: TopDown
-    layers: dict[str, Float[np.ndarray, "X Y"]]
+    layers: Mapping[str, Float[np.ndarray, "X Y"]]
     own: tuple[slice, slice]
 
     @property

@@ -160,6 +160,32 @@ class Block(NamedTuple):
     corner: tuple[int, int]
 
 
+class Layers(Mapping[str, Float[np.ndarray, "X Y"]]):
+    """Layers of the top-down map over a rectangle of columns, each read when it is asked for."""
+
+    def __init__(self, names: Iterable[str], read: Callable[[str], Float[np.ndarray, "X Y"]]) -> None:
+        """Of these names."""
+        self._names, self._read = tuple(names), read
+
+    def __getitem__(self, name: str) -> Float[np.ndarray, "X Y"]:
+        """Reads a layer."""
+        if name not in self._names:
+            raise KeyError(name)
+        return self._read(name)
+
+    def __contains__(self, name: object) -> bool:
+        """Reads nothing."""
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        """Their names."""
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._names)
+
+
 @dataclass(frozen=True, eq=False)
 class MapReader:
     """A map of any size, to be gone through block by block.
@@ -173,7 +199,7 @@ class MapReader:
         places: where its blocks lie in the grid; what lies in none was not observed.
         blocks: `(margin=0, within=None) -> Iterator[Block]`, blocks that together hold all that was observed, each
             column once, with as many columns around them; of those only the ones that touch the columns `within`.
-        layers: `(columns) -> {name: array}`, the layers of the top-down map over a rectangle of the grid.
+        layers: `(columns) -> Layers`, over a rectangle of the grid.
     """
 
     grid: GridSpec
@@ -183,7 +209,7 @@ class MapReader:
     surface: bool
     places: tuple[Columns, ...]
     blocks: Callable[..., Iterator[Block]]
-    layers: Callable[[Columns], dict[str, Float[np.ndarray, "X Y"]]]
+    layers: Callable[[Columns], Layers]
 
     @property
     def whole(self) -> Columns:
@@ -209,8 +235,8 @@ def in_memory(voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
     def blocks(margin: int = 0, within: Columns | None = None) -> Iterator[Block]:
         yield Block(voxel_map, whole, (0, 0))
 
-    def layers(place: Columns) -> dict[str, Float[np.ndarray, "X Y"]]:
-        return {name: np.asarray(values)[place] for name, values in attributes.layers.items()}
+    def layers(place: Columns) -> Layers:
+        return Layers(attributes.layers, lambda name: np.asarray(attributes.layers[name])[place])
 
     kept = voxel_map.surface is not None
     return MapReader(voxel_map.grid, voxel_map.classes, count, attributes, kept, (whole,), blocks, layers)
@@ -264,8 +290,8 @@ def open_map(path: str | os.PathLike[str]) -> MapReader:
             voxel_map = VoxelMap(jnp.asarray(log_odds), count, part, classes, surface=surface)
             yield Block(voxel_map, (x, y), (place[0].start, place[1].start))
 
-    def layers(place: Columns) -> dict[str, Float[np.ndarray, "X Y"]]:
-        return {name: read_part(arrays[name], place, target, finite=False) for name in attributes.layers}
+    def layers(place: Columns) -> Layers:
+        return Layers(attributes.layers, lambda name: read_part(arrays[name], place, target, finite=False))
 
     kept = heights is not None
     return MapReader(grid, classes, frames_fused, attributes, kept, places, blocks, layers)

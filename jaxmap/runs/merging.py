@@ -125,6 +125,9 @@ def merge_sessions(
     notes = _write_poses(sessions, firsts, folder)
     if reader.attributes.crs is None:
         notes.append("no run has a CRS: their worlds are taken for one and the same")
+    if not reader.surface and any(session.reader.surface for session in sessions):
+        without = ", ".join(str(session.folder.path) for session in sessions if not session.reader.surface)
+        notes.append(f"{without} keeps no heights: the sum has none, and no hazards")
     key_frames = {}
     for session, first in zip(sessions, firsts, strict=True):
         key_frames |= _take_key_frames(session, folder, first, reader.attributes.site_origin)
