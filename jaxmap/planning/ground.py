@@ -22,7 +22,7 @@ from jaxmap.types import GridSpec
 _REACH_M = 0.1
 """Columns so far around lend their points to far ground, of which there are few."""
 
-LEAST_COLUMNS = 1.4
+_LEAST_COLUMNS = 1.4
 """Columns in the radius of a rover, at least: a plane needs heights around its middle."""
 
 LAYERS = ("surface_m", "surface_sigma_m", *Hazards._fields)
@@ -76,7 +76,7 @@ def hazards_of(surface: Surface, cell_m: tuple[float, float], rover: RoverOption
     Raises:
         JaxmapError: the cells are too large for it.
     """
-    if rover.radius_m < LEAST_COLUMNS * max(cell_m):
+    if rover.radius_m < _LEAST_COLUMNS * max(cell_m):
         raise JaxmapError(
             f"a rover of radius {rover.radius_m:g} m on columns of {max(cell_m):g} m",
             where="rover",
@@ -93,9 +93,14 @@ def ground_layers(surface: Surface, hazards: Hazards) -> dict[str, Float[np.ndar
     return dict(zip(LAYERS, (*heights, *map(np.asarray, hazards)), strict=True))
 
 
+def fine_enough(grid: GridSpec, rover: RoverOptions) -> bool:
+    """Whether the columns of a grid are small enough for the hazards of a rover."""
+    return rover.radius_m >= _LEAST_COLUMNS * max(cell_size(grid))
+
+
 def keeps_layers(reader: MapReader, rover: RoverOptions) -> bool:
     """Whether a map keeps heights, and its columns are fine enough for the hazards of a rover."""
-    return reader.surface and rover.radius_m >= LEAST_COLUMNS * max(cell_size(reader.grid))
+    return reader.surface and fine_enough(reader.grid, rover)
 
 
 def map_layers(

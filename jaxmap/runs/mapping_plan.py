@@ -26,6 +26,7 @@ from jaxmap.mapping.regions import frames_of_tiles, region_shape
 from jaxmap.mapping.sequence import PreparedFrame, frame_form, observed_frames, prepare_frames
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.mapping.tiles import block_shape, channels_of, whole_tiles
+from jaxmap.planning.ground import cell_size, fine_enough
 from jaxmap.planning.options import ROVER_SETTINGS, RoverOptions
 from jaxmap.runs.config import MapConfig, PerceiveConfig
 from jaxmap.runs.labelling import Notify, as_usage_error
@@ -262,7 +263,7 @@ def plan_run(
         key=key,
         pose_errors=pose_errors,
         block_shape=block,
-        rover=ROVER_SETTINGS.load(config.rover),
+        rover=_rover_of(config.rover, grid, notify),
     )
 
 
@@ -318,6 +319,20 @@ def _in_regions(
             fix="take fewer workers, larger voxels (--grid.voxel-size-m), or raise --grid.max-memory-gib",
         )
     return grid, shape
+
+
+def _rover_of(name_or_path: str, grid: GridSpec, notify: Notify) -> RoverOptions:
+    """The rover whose hazards are measured; says where columns are too large for that.
+
+    Raises:
+        UsageError: there is no such file, or it says something else.
+    """
+    rover, cell_m = ROVER_SETTINGS.load(name_or_path), max(cell_size(grid))
+    if not fine_enough(grid, rover):
+        notify(
+            f"note: columns of {cell_m:g} m show no hazards of a rover of radius {rover.radius_m:g} m: none are kept"
+        )
+    return rover
 
 
 def _note_other_noise(observations: Observations, config: MapConfig, notify: Notify) -> None:
