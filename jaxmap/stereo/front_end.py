@@ -75,7 +75,7 @@ class StereoFrontEnd:
         self.rectified_here = self.rectifier is not None
         self.camera: StereoCamera = camera
         self.matcher = Matcher(options, camera.width_px)
-        self._near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
+        self.near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> RectifiedFrame:
         """Rectifies and matches one pair.
@@ -98,7 +98,7 @@ class StereoFrontEnd:
             disparity_px = self.matcher(left, right)
             if self.rectifier is not None:
                 disparity_px[~self.rectifier.seen] = np.nan
-            near = None if self._near_guard is None else self._near_guard(left, right)
+            near = None if self.near_guard is None else self.near_guard(left, right)
             if near is not None:
                 disparity_px[near.pixels] = np.nan
         times_s = stages_s["rectify"], stages_s["match"]

@@ -126,7 +126,7 @@ class Matcher:
         image_px = left.size
         pad = max(self.num_disparities + self.options.min_disparity_px, 0) if self.options.pad_left else 0
         left, right = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
-        raw = self._engine(image_px).compute(left, right)[:, pad:]
+        raw = self.engine(image_px).compute(left, right)[:, pad:]
         disparity_px = np.multiply(raw, np.float32(1 / _SUBPIXELS), dtype=np.float32)
         np.copyto(disparity_px, np.nan, where=raw < self.options.min_disparity_px * _SUBPIXELS)
         return self._without_edges(disparity_px)
@@ -153,7 +153,7 @@ class Matcher:
         other_way = np.isfinite(self(right, left)).mean()
         return bool(other_way > 0.2 and other_way > 1.4 * valid)
 
-    def _engine(self, image_px: int) -> Any:
+    def engine(self, image_px: int) -> Any:
         # Imported here, so that the command line can read the options without OpenCV.
         import cv2
 
