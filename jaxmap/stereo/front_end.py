@@ -14,7 +14,7 @@ from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.align import alignment_homography, estimate_alignment, match_features
 from jaxmap.stereo.blank import blank_reason
-from jaxmap.stereo.match import Matcher, StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions, as_grey
 from jaxmap.stereo.near import NearGuard
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
 from jaxmap.types import StereoCamera
@@ -95,10 +95,11 @@ class StereoFrontEnd:
                     raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
             left, right = self.rectify(left, right)
         with timed_stage("match", stages_s):
-            disparity_px = self.matcher(left, right)
+            both_grey = as_grey(left), as_grey(right)
+            disparity_px = self.matcher(*both_grey)
             if self.rectifier is not None:
                 disparity_px[~self.rectifier.seen] = np.nan
-            near = None if self.near_guard is None else self.near_guard(left, right)
+            near = None if self.near_guard is None else self.near_guard(*both_grey)
             if near is not None:
                 disparity_px[near.pixels] = np.nan
         times_s = stages_s["rectify"], stages_s["match"]
