@@ -47,6 +47,8 @@ class StereoFrontEnd:
         rectified_here: whether the images are raw, and rectified by it.
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
         alignment_rad: rotation vector by which the rectified right camera is corrected, or None.
+        matcher: of the rectified images.
+        near_guard: finds what is too near for the matcher, or None where that was not asked for.
     """
 
     def __init__(

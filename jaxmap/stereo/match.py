@@ -153,10 +153,10 @@ class Matcher:
         return bool(other_way > 0.2 and other_way > 1.4 * valid)
 
     def engine(self, image_px: int) -> Any:
+        """OpenCV's matcher of grey images of so many pixels; each thread has its own, which reuses its buffers."""
         # Imported here, so that the command line can read the options without OpenCV.
         import cv2
 
-        # An engine reuses its buffers, so each thread has its own.
         if not hasattr(self._local, "engine"):
             options, unchecked = self.options, self.options.left_right_max_diff_px < 0
             p1, p2 = options.penalties()
