@@ -16,8 +16,8 @@ FLOORS = (
     # pure geometry
     "geometry localisation",
     "models stereo fusion profiling",
-    # what labels points, what doubts a map, what reads logs
-    "labellers ensemble datasets",
+    # what labels points, what doubts a map, what matches pairs inside the step, what reads logs
+    "labellers ensemble matching datasets",
     # the compiled step, what feeds it, and the map on disk
     "mapping",
     # what is built on maps

@@ -32,6 +32,21 @@ class StereoOptions:
     align: bool = False
     """Estimate a rotation of the right camera under which the rows of both images agree, from matches in some frames,
     and rectify all frames with it: for a calibration that is slightly off (`jaxmap check` says so)."""
+    matcher: Literal["opencv", "sgm", "mccnn"] = "opencv"
+    """OpenCV's on the host, or semi-global matching inside the compiled step, by hand-made costs or a network's."""
+    cost: Literal["census", "bt"] = "census"
+    """matcher sgm: compares the order of grey levels around two pixels, or grey levels (Birchfield-Tomasi)."""
+    paths: Literal[4, 8] = 8
+    """matchers sgm, mccnn: directions along which costs are aggregated."""
+    step_penalty: Annotated[float, Interval(ge=0, le=1)] | None = None
+    """matchers sgm, mccnn: cost of a disparity step of one, where the worst match costs 1; by default, what suits the
+    cost."""
+    jump_penalty: Annotated[float, Interval(ge=0, le=2)] | None = None
+    """matchers sgm, mccnn: cost of a greater step."""
+    soft: bool = False
+    """matchers sgm, mccnn: soft minima, slower, through which gradients reach images and penalties."""
+    temperature: Annotated[float, Interval(ge=1e-4, le=10)] = 0.05
+    """How soft, in units of the cost."""
     mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
     min_disparity_px: Annotated[int, count(1024, least=-1024)] = 0

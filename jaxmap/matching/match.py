@@ -1,0 +1,44 @@
+"""Semi-global matching: a rectified pair in, disparity out."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Num
+
+from jaxmap.matching.aggregate import aggregate
+from jaxmap.matching.costs import cost_volume
+from jaxmap.matching.design import MatchDesign, MatchParams
+from jaxmap.matching.select import select
+
+
+def match(
+    design: MatchDesign, left: Num[Array, "H W *rgb"], right: Num[Array, "H W *rgb"], params: MatchParams
+) -> Float[Array, "H W"]:
+    """Disparity of the left image in px, float32; NaN where it is unknown.
+
+    Args:
+        design: what is fixed before compiling.
+        left: rectified, grey or RGB, 0 to 255.
+        right: likewise, of the same size.
+        params: the numbers.
+    """
+    left, right = grey(left), grey(right)
+    volume = cost_volume(design, left, right, params)
+    p1, p2 = penalties(design, params)
+    total = aggregate(volume, p1, p2, design.paths, params.temperature if design.soft else None)
+    return select(design, total, params)
+
+
+def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
+    """The penalties in the units of the volume of costs."""
+    if design.soft:
+        return params.p1, params.p2
+    return tuple(jnp.round(p * design.cost_steps).astype(jnp.uint8) for p in (params.p1, params.p2))  # pyright: ignore
+
+
+def grey(image: Num[Array, "H W *rgb"]) -> Num[Array, "H W"]:
+    """Luminance of an RGB image (ITU-R BT.601), rounded as OpenCV does where it holds integers."""
+    if image.ndim == 2:
+        return image
+    weighed = image.astype(jnp.float32) @ jnp.asarray([0.299, 0.587, 0.114], jnp.float32)
+    return jnp.floor(weighed + 0.5).astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.integer) else weighed
