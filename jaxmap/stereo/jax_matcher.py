@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from jaxmap.errors import FrameError
-from jaxmap.matching.design import MatchDesign, MatchParams, make_match_params
+from jaxmap.matching.design import Cost, MatchDesign, MatchParams, make_match_params
 from jaxmap.matching.match import match
 from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.types import to_device
@@ -65,3 +66,37 @@ def _matched(
     design: MatchDesign, left: Shaped[Array, "H W *rgb"], right: Shaped[Array, "H W *rgb"], params: MatchParams
 ) -> Float[Array, "H W"]:
     return match(design, left, right, params)
+
+
+def match_params(options: StereoOptions, weights: Any = None) -> MatchParams:
+    """The numbers that the options of stereo name; `weights` are those of the cost network."""
+    return make_match_params(
+        _cost(options),
+        p1=options.step_penalty,
+        p2=options.jump_penalty,
+        uniqueness=options.uniqueness_ratio / 100,
+        temperature=options.temperature,
+        weights=weights,
+    )
+
+
+def match_design(options: StereoOptions, width_px: int) -> MatchDesign:
+    """The design that the options of stereo name, for images of this width."""
+    return MatchDesign(
+        cost=_cost(options),
+        min_disparity_px=options.min_disparity_px,
+        num_disparities=options.num_disparities or -(-width_px // (8 * 16)) * 16,
+        paths=options.paths,
+        soft=options.soft,
+        block_size=options.block_size if options.cost == "bt" else 1,
+        pre_filter_cap=options.pre_filter_cap,
+        left_right_max_diff_px=options.left_right_max_diff_px,
+        speckle_window_px=options.speckle_window,
+        speckle_range_px=options.speckle_range_px,
+        edge_step_px=options.edge_step_px,
+        edge_window_px=options.edge_window_px,
+    )
+
+
+def _cost(options: StereoOptions) -> Cost:
+    return "mccnn" if options.matcher == "mccnn" else options.cost
