@@ -10,11 +10,16 @@ from jaxmap.matching.costs import cost_volume
 from jaxmap.matching.design import MatchDesign, MatchParams
 from jaxmap.matching.select import select
 
+_SUBPIXELS = 16
+
 
 def match(
     design: MatchDesign, left: Num[Array, "H W *rgb"], right: Num[Array, "H W *rgb"], params: MatchParams
 ) -> Float[Array, "H W"]:
     """Disparity of the left image in px, float32; NaN where it is unknown.
+
+    But in soft mode it is a multiple of 1/16, as OpenCV's are and as observations are kept: a map comes out the same
+    whichever way its frames went.
 
     Args:
         design: what is fixed before compiling.
@@ -26,7 +31,8 @@ def match(
     volume = cost_volume(design, left, right, params)
     p1, p2 = penalties(design, params)
     total = aggregate(volume, p1, p2, design.paths, params.temperature if design.soft else None)
-    return select(design, total, params)
+    disparity_px = select(design, total, params)
+    return disparity_px if design.soft else jnp.round(disparity_px * _SUBPIXELS) / _SUBPIXELS
 
 
 def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
