@@ -14,13 +14,13 @@ from jaxtyping import Array, Int, UInt8, UInt16
 
 STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 """Rows and columns from one pixel of a path to the next: along rows and columns, then along diagonals."""
-_LANES, _IN_WORD, _WARPS = 32, 4, 4
-"""Threads of a warp, costs in a 32-bit word, and lines that the warps of one program walk side by side."""
+_LANES, _IN_WORD = 32, 4
+"""Threads of a warp, and costs in a 32-bit word."""
 _FAR = 1 << 14
 """Greater than all costs: that of disparities that are not searched."""
 
-Costs = list[Int[Array, "lines lanes"]]
-"""The costs of a pixel of each line; thread `i` holds the disparities `i n` to `(i + 1) n - 1` as its items in the n
+Costs = list[Int[Array, "lanes"]]
+"""The costs of a pixel; thread `i` holds the disparities `i n` to `(i + 1) n - 1` as its items in the n
 arrays, so that only the first and the last need another thread's."""
 
 _Shift = Callable[[Array, int], Array]
@@ -47,8 +47,8 @@ def aggregate_gpu(
     ends = pl.pallas_call(
         functools.partial(_walk, size=(height, width), count=count, shift=_rolled if interpret else _shuffled),
         out_shape=jax.ShapeDtypeStruct((paths * words.size,), jnp.int32),
-        grid=(-(-max(height, width) // _WARPS), paths),
-        compiler_params=plgpu.CompilerParams(num_warps=_WARPS, num_stages=1),
+        grid=(max(height, width), paths),
+        compiler_params=plgpu.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name="walk_paths",
     )(
@@ -64,44 +64,49 @@ def aggregate_gpu(
 def _walk(
     volume: Any, directions: Any, penalties: Any, ends: Any, *, size: tuple[int, int], count: int, shift: _Shift
 ) -> None:
-    """The program of one block of lines in one direction: reads each pixel's costs, writes those of the path to it."""
+    """The program of one line in one direction, and of one warp: thread `i` holds item `i` of every array."""
     (height, width), path = map(jnp.int32, size), pl.program_id(1)
     down, right = directions[path, 0], directions[path, 1]
     p1, p2 = penalties[0], penalties[1]
-    lane = jax.lax.broadcasted_iota(jnp.int32, (_WARPS, _LANES), 1)
-    along_row, per_lane = down == 0, -(-count // (_LANES * _IN_WORD))
+    lane, per_lane = jax.lax.iota(jnp.int32, _LANES), -(-count // (_LANES * _IN_WORD))
+    along_row = down == 0
     steps, lines = jnp.where(along_row, width, height), jnp.where(along_row, height, width)
-    # Where the last block has too few lines, it walks the last one several times.
-    line = pl.program_id(0) * _WARPS + jax.lax.broadcasted_iota(jnp.int32, (_WARPS, _LANES), 0)
-    line = jnp.minimum(line, lines - 1)
-    first_row = jnp.where(along_row, line, jnp.where(down > 0, jnp.int32(0), height - 1))
-    first_column = jnp.where(along_row, jnp.where(right > 0, jnp.int32(0), width - 1), line)
+    # Where the image has fewer lines that way, the last one is walked several times.
+    line = jnp.minimum(pl.program_id(0), lines - 1)
+    row = jnp.where(along_row, line, jnp.where(down > 0, jnp.int32(0), height - 1))
+    column = jnp.where(along_row, jnp.where(right > 0, jnp.int32(0), width - 1), line)
+
+    def words(row: Array, column: Array) -> Array:
+        return ((row * width + column) * _LANES + lane) * per_lane
+
+    def read(row: Array, column: Array) -> list[Array]:
+        return [plgpu.load(volume.at[words(row, column) + word]) for word in range(per_lane)]
 
     def step(_: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        row, column, *before = carry
-        place = ((row * width + column) * _LANES + lane) * per_lane
-        read = [plgpu.load(volume.at[place + word]) for word in range(per_lane)]
-        costs = [(word >> 8 * byte) & 0xFF for word in read for byte in range(_IN_WORD)]
+        (row, column), packed, before = carry
+        next_row, next_column = row + down, column + right
+        # A diagonal that leaves at one side goes on at the other, as a new path.
+        leaves = (next_column < 0) | (next_column >= width)
+        next_column = jnp.where(leaves, width - jnp.abs(next_column), next_column)
+        # Read a step ahead, since memory takes longer than a step; after the last, any pixel.
+        ahead = read(jnp.clip(next_row, 0, height - 1), next_column)
+        costs = [(word >> 8 * byte) & 0xFF for word in packed for byte in range(_IN_WORD)]
         here = [cost + way for cost, way in zip(costs, _cheapest_step(before, p1, p2, lane, shift), strict=True)]
         if count % (_LANES * _IN_WORD):
             here = [jnp.where(lane * len(here) + item < count, one, _FAR) for item, one in enumerate(here)]
-        place += path * (height * width * _LANES * per_lane)
+        place = path * (height * width * _LANES * per_lane) + words(row, column)
         for word in range(per_lane):
             four = enumerate(here[_IN_WORD * word : _IN_WORD * (word + 1)])
             plgpu.store(ends.at[place + word], sum((one & 0xFF) << 8 * byte for byte, one in four))
-        # A diagonal that leaves at one side goes on at the other, as a new path.
-        row, column = row + down, column + right
-        outside = (column < 0) | (column >= width)
-        column = jnp.where(outside, width - jnp.abs(column), column)
-        return row, column, *(jnp.where(outside, 0, one) for one in here)
+        return (next_row, next_column), ahead, [jnp.where(leaves, 0, one) for one in here]
 
-    start = [jnp.zeros((_WARPS, _LANES), jnp.int32)] * (per_lane * _IN_WORD)
-    jax.lax.fori_loop(0, steps, step, (first_row, first_column, *start))
+    start = [jnp.zeros(_LANES, jnp.int32)] * (per_lane * _IN_WORD)
+    jax.lax.fori_loop(0, steps, step, ((row, column), read(row, column), start))
 
 
 def _cheapest_step(before: Sequence[Array], p1: Array, p2: Array, lane: Array, shift: _Shift) -> Costs:
     """What it costs to come from the pixel before, above its least cost; `p2` at most."""
-    least = functools.reduce(jnp.minimum, before).min(axis=1, keepdims=True)
+    least = functools.reduce(jnp.minimum, before).min()
     stay = [jnp.minimum(one - least, p2) for one in before]
     lower = jnp.where(lane == 0, _FAR, shift(stay[-1], 1))
     upper = jnp.where(lane == _LANES - 1, _FAR, shift(stay[0], -1))
@@ -125,7 +130,7 @@ def _shuffled(values: Array, by: int) -> Array:
 
 
 def _rolled(values: Array, by: int) -> Array:
-    return jnp.roll(values, by, axis=1)
+    return jnp.roll(values, by)
 
 
 def _sum_of_bytes(words: Int[Array, "paths H W words"]) -> UInt16[Array, "H W D"]:
