@@ -37,8 +37,11 @@ def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
 
 
 def grey(image: Num[Array, "H W *rgb"]) -> Num[Array, "H W"]:
-    """Luminance of an RGB image (ITU-R BT.601), rounded as OpenCV does where it holds integers."""
+    """Luminance of an RGB image (ITU-R BT.601); of integers in OpenCV's integer arithmetic, alike in any program."""
     if image.ndim == 2:
         return image
-    weighed = image.astype(jnp.float32) @ jnp.asarray([0.299, 0.587, 0.114], jnp.float32)
-    return jnp.floor(weighed + 0.5).astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.integer) else weighed
+    red, green, blue = (image[..., channel] for channel in range(3))
+    if not jnp.issubdtype(image.dtype, jnp.integer):
+        return 0.299 * red + 0.587 * green + 0.114 * blue
+    red, green, blue = (channel.astype(jnp.int32) for channel in (red, green, blue))
+    return ((9798 * red + 19235 * green + 3735 * blue + (1 << 14)) >> 15).astype(image.dtype)
