@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,10 @@ MOST_VOXELS_ALONG = 2**23
 MOST_CAMERA_PX, MOST_BASELINE_M = 1e6, 1e4
 """Focal lengths and principal points, and baselines, beyond these are mistakes; float32 must hold their products."""
 _LEAST = 1e-6
+
+
+DistortionModel = Literal["opencv", "equidistant"]
+"""How a lens bends rays: OpenCV's usual model, or that of a fisheye."""
 
 
 def _static() -> dict[str, bool]:

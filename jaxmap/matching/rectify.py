@@ -11,13 +11,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxmap.stereo.rectify import DistortionModel, StereoRig
-from jaxmap.types import StereoCamera, to_device
+from jaxmap.types import DistortionModel, StereoCamera
 
-_COEFFICIENTS = 14
 _LEAST_COSINE = 1e-3
 """Rays that are flatter are not in any image."""
 
@@ -60,23 +57,6 @@ class RectifiedPair(NamedTuple):
     right: Float[Array, "H W *rgb"]
     left_seen: Bool[Array, "H W"]
     right_seen: Bool[Array, "H W"]
-
-
-def make_raw_pair(rig: StereoRig, R_aligned: np.ndarray | None = None) -> RawPair:
-    """The numbers of a calibration on the device; `R_aligned` (3, 3) as `make_rectifier` takes it."""
-
-    def camera(K: np.ndarray, distortion: np.ndarray) -> RawCamera:
-        numbers = {"fx_px": K[0, 0], "fy_px": K[1, 1], "cx_px": K[0, 2], "cy_px": K[1, 2]}
-        count = 4 if rig.model == "equidistant" else _COEFFICIENTS
-        lens = np.pad(distortion, (0, count - distortion.size))
-        leaves = {name: to_device(value, np.float32) for name, value in numbers.items()}
-        return RawCamera(**leaves, distortion=to_device(lens, np.float32), model=rig.model)
-
-    turn = jaxlie.SO3.from_matrix(to_device(np.eye(3) if R_aligned is None else R_aligned, np.float32))
-    R_right_left = jaxlie.SO3.from_matrix(to_device(rig.R_right_left, np.float32))
-    moved = jaxlie.SE3.from_rotation_and_translation(R_right_left, to_device(rig.t_right_left_m, np.float32))
-    left, right = camera(rig.K_left, rig.distortion_left), camera(rig.K_right, rig.distortion_right)
-    return RawPair(left, right, moved, turn)
 
 
 def rectify_pair(

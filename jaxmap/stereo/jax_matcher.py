@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import jax
@@ -40,6 +41,7 @@ class JaxMatcher:
         self.options = options
         self.design, self.params = match_design(options, width_px), match_params(options)
         self.num_disparities = self.design.num_disparities
+        self._lock = Lock()
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Disparity of the left image.
@@ -58,7 +60,9 @@ class JaxMatcher:
         if left.shape[:2] != right.shape[:2]:
             sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
             raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
-        return np.array(_matched(self.design, to_device(left), to_device(right), self.params))
+        # One pair at a time takes all cores, and a volume of costs for each of several threads much memory.
+        with self._lock:
+            return np.array(_matched(self.design, to_device(left), to_device(right), self.params))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -13,8 +13,8 @@ import pytest
 from rigs import RIG
 from scipy.ndimage import map_coordinates
 
-from jaxmap.matching.rectify import RawPair, make_raw_pair, rectify_pair, rectifying_rotations
-from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier
+from jaxmap.matching.rectify import RawPair, rectify_pair, rectifying_rotations
+from jaxmap.stereo.rectify import Rectifier, StereoRig, make_raw_pair, make_rectifier
 
 pytestmark = pytest.mark.slow
 """Each compiles the rectification of a pair."""

@@ -10,10 +10,8 @@ from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
 from planned_runs import config_of, log_odds, planned
 from scenes import scene_frame
 
-from jaxmap.host.files import real_path
 from jaxmap.mapping.observations import open_observations
 from jaxmap.runs.mapping_plan import plan_run
-from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.stereo.jax_matcher import JaxMatcher
 
 SGM = ("--stereo.matcher", "sgm")
@@ -61,10 +59,14 @@ def test_a_map_is_the_same_however_its_frames_were_matched(scene_folder, cli, tm
     assert cli(*map_words(tmp_path / "seen", tmp_path / "anew")).status == 0
     for name in ("kept", "anew"):
         np.testing.assert_array_equal(log_odds(tmp_path / name), log_odds(tmp_path / "step"))
-    for index, observation in enumerate(map(open_observations(tmp_path / "seen/observations.zarr").observation, (0, 1))):
+    observations, front_end = (
+        open_observations(observed(tmp_path / "seen")),
+        planned(scene_folder, **SETTINGS).front_end,
+    )
+    for index in range(2):
         view = scene_frame(index)
-        disparity_px = planned(scene_folder, **SETTINGS).front_end(view.left, view.right).disparity_px
-        np.testing.assert_array_equal(observation.disparity_px, disparity_px)
+        disparity_px = front_end(view.left, view.right).disparity_px
+        np.testing.assert_array_equal(observations.observation(index).disparity_px, disparity_px)
         off = np.abs(disparity_px - view.disparity_px)
         assert np.nanmedian(off) < 0.3 and np.isfinite(disparity_px).mean() > 0.4
     outcome = cli("explain", tmp_path / "step", "--at", 0.6, 2.6, "--out", tmp_path / "why.html")
