@@ -13,9 +13,9 @@ from jaxmap.types import to_device
 
 Cost = Literal["census", "bt", "mccnn"]
 
-_MOST_STEPS, _MOST_SUM = 85, 255
+_MOST_STEPS = 63
 MOST_P1, MOST_P2 = 1.0, 2.0
-"""Where a cost is 85 steps at most, a path's costs with these penalties fit into 8 bits."""
+"""Where a cost is 63 steps at most, what two paths add up to fits into 8 bits."""
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
-from jaxmap.matching.aggregate import aggregate
-from jaxmap.matching.costs import cost_volume
+from jaxmap.matching.aggregate import aggregate_planes
+from jaxmap.matching.costs import cost_planes
 from jaxmap.matching.design import MatchDesign, MatchParams
-from jaxmap.matching.select import select
+from jaxmap.matching.select import decide, winners
 
 _SUBPIXELS = 16
 
@@ -28,10 +28,9 @@ def match(
         params: the numbers.
     """
     left, right = grey(left), grey(right)
-    volume = cost_volume(design, left, right, params)
+    costs, turned = (cost_planes(design, left, right, turned=turned) for turned in (False, True))
     p1, p2 = penalties(design, params)
-    total = aggregate(volume, p1, p2, design.paths, params.temperature if design.soft else None)
-    disparity_px = select(design, total, params)
+    disparity_px = decide(design, aggregate_planes(costs, turned, p1, p2, design.paths, winners), params)
     return disparity_px if design.soft else jnp.round(disparity_px * _SUBPIXELS) / _SUBPIXELS
 
 
@@ -39,7 +38,8 @@ def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
     """The penalties in the units of the volume of costs."""
     if design.soft:
         return params.p1, params.p2
-    return tuple(jnp.round(p * design.cost_steps).astype(jnp.uint8) for p in (params.p1, params.p2))  # pyright: ignore
+    p1, p2 = (jnp.round(p * design.cost_steps).astype(jnp.uint8) for p in (params.p1, params.p2))
+    return p1, p2
 
 
 def grey(image: Num[Array, "H W *rgb"]) -> Num[Array, "H W"]:

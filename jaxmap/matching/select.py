@@ -2,80 +2,116 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxmap.matching.costs import inside
+from jaxmap.matching.aggregate import least
+from jaxmap.matching.blobs import drop_blobs
 from jaxmap.matching.design import MatchDesign, MatchParams
 
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 
 
+class Winners(NamedTuple):
+    """What is kept of the aggregated costs of pixels, in the order of disparities from the smallest searched.
+
+    Attributes:
+        place: the cheapest disparity.
+        cost: what it costs.
+        second: the least cost of a disparity that is not its neighbour.
+        lower: the cost of the disparity before it; its own where there is none.
+        higher: likewise of the one after it.
+        other: the cheapest disparity of the column x + `min_disparity_px` of the right image, for W + D values of x
+            from the least of `min_disparity_px` and 0.
+    """
+
+    place: Int[Array, "*H W"]
+    cost: Num[Array, "*H W"]
+    second: Num[Array, "*H W"]
+    lower: Num[Array, "*H W"]
+    higher: Num[Array, "*H W"]
+    other: Int[Array, "*H W_D"]
+
+
 def select(design: MatchDesign, total: Num[Array, "H W D"], params: MatchParams) -> Float[Array, "H W"]:
     """Disparity with the least aggregated cost in px, float32; NaN where it is doubtful."""
-    best = jnp.argmin(total, -1).astype(jnp.int32)
-    good = _is_unique(total, best, params.uniqueness) & inside(design, total.shape[1])[:, 0]
-    disparity_px = design.min_disparity_px + _between_pixels(total, best)
+    return decide(design, jax.vmap(winners)(total.swapaxes(1, 2)), params)
+
+
+def winners(total: Num[Array, "D W"]) -> Winners:
+    """The winners of a row of pixels."""
+    count, width = total.shape
+    cost = least(total)
+    place = _place(total, cost)
+    apart = jnp.abs(jnp.arange(count, dtype=place.dtype)[:, None] - place) > 1
+    second = least(jnp.where(apart, total, _most(total)))
+    lower, higher = (jnp.take_along_axis(total, jnp.clip(place + step, 0, count - 1)[None], 0)[0] for step in (-1, 1))
+    # A column of the right image sees disparity d at column x + d of the left one: d places on in row d.
+    wide = jnp.pad(total, ((0, 0), (0, count)), constant_values=_most(total)).reshape(-1)
+    skewed = jnp.pad(wide, (0, count), constant_values=_most(total)).reshape(count, width + count + 1)
+    return Winners(place, cost, second, lower, higher, _place(skewed[:, :width], least(skewed[:, :width])))
+
+
+def _place(total: Num[Array, "D W"], cost: Num[Array, "W"]) -> Int[Array, "W"]:
+    """The first disparity of that cost."""
+    count = total.shape[0]
+    return least(jnp.where(total == cost, jnp.arange(count, dtype=jnp.int16)[:, None], jnp.int16(count - 1)))
+
+
+def _most(total: Num[Array, "D W"]) -> Any:
+    return jnp.iinfo(total.dtype).max if jnp.issubdtype(total.dtype, jnp.integer) else jnp.inf
+
+
+def decide(design: MatchDesign, winner: Winners, params: MatchParams) -> Float[Array, "H W"]:
+    """The disparity in px of winners that nothing makes doubtful, NaN of the others."""
+    width = winner.place.shape[1]
+    place = winner.place.astype(jnp.int32)
+    match_column = jnp.arange(width) - design.min_disparity_px - place
+    good = (match_column >= 0) & (match_column < width)
+    good &= winner.second.astype(jnp.float32) * (1 - params.uniqueness) >= winner.cost.astype(jnp.float32)
     if design.left_right_max_diff_px >= 0:
-        good &= _agrees_from_right(design, total, best)
-    disparity_px = jnp.where(good, disparity_px, jnp.nan)
+        good &= _agrees(design, place, winner.other)
+    disparity_px = jnp.where(good, design.min_disparity_px + between_pixels(design, winner), jnp.nan)
     disparity_px = drop_speckles(design, disparity_px)
     return drop_edges(design, disparity_px)
 
 
-def _at(total: Num[Array, "H W D"], place: Int[Array, "H W"]) -> Num[Array, "H W"]:
-    return jnp.take_along_axis(total, place[..., None], -1)[..., 0]
+def between_pixels(design: MatchDesign, winner: Winners) -> Float[Array, "H W"]:
+    """The minimum of the parabola through the winner and its neighbours, in places."""
+    lower, here, higher = (cost.astype(jnp.float32) for cost in (winner.lower, winner.cost, winner.higher))
+    bend = lower + higher - 2 * here
+    offset = jnp.where(bend > 0, (lower - higher) / (2 * jnp.where(bend > 0, bend, 1)), 0)
+    has_both = (winner.place > 0) & (winner.place < design.num_disparities - 1)
+    return winner.place + jnp.where(has_both, offset, 0)
 
 
-def _is_unique(total: Num[Array, "H W D"], best: Int[Array, "H W"], share: Any) -> Bool[Array, "H W"]:
-    """Whether the winner is cheaper by that share than all but its neighbours."""
-    apart = jnp.abs(jnp.arange(total.shape[-1]) - best[..., None]) > 1
-    second = jnp.where(apart, total.astype(jnp.float32), jnp.inf).min(-1)
-    return second * (1 - share) >= _at(total, best)
-
-
-def _between_pixels(total: Num[Array, "H W D"], best: Int[Array, "H W"]) -> Float[Array, "H W"]:
-    """The minimum of the parabola through the winner and its neighbours."""
-    last = total.shape[-1] - 1
-    before, after = (_at(total, jnp.clip(best + step, 0, last)).astype(jnp.float32) for step in (-1, 1))
-    here = _at(total, best).astype(jnp.float32)
-    bend = before + after - 2 * here
-    offset = jnp.where(bend > 0, (before - after) / (2 * jnp.maximum(bend, 1)), 0)
-    return best + jnp.where((best > 0) & (best < last), offset, 0)
-
-
-def _agrees_from_right(design: MatchDesign, total: Num[Array, "H W D"], best: Int[Array, "H W"]) -> Bool[Array, "H W"]:
+def _agrees(design: MatchDesign, place: Int[Array, "H W"], other: Int[Array, "H W"]) -> Bool[Array, "H W"]:
     """Whether the pixel of the right image that was matched prefers about the same disparity."""
-    width, count = total.shape[1:]
-    disparity = design.min_disparity_px + jnp.arange(count)
-    column = jnp.arange(width)[:, None] + disparity
-    seen = (column >= 0) & (column < width)
-    moved = total[:, jnp.clip(column, 0, width - 1), jnp.arange(count)]
-    most = jnp.iinfo(total.dtype).max if jnp.issubdtype(total.dtype, jnp.integer) else jnp.inf
-    right = jnp.argmin(jnp.where(seen, moved, most), -1)
-    there = jnp.clip(jnp.arange(width) - design.min_disparity_px - best, 0, width - 1)
-    other = jnp.take_along_axis(right, there, 1)
-    return jnp.abs(other - best) <= design.left_right_max_diff_px
+    column = jnp.arange(place.shape[1]) - place
+    there = jnp.take_along_axis(other, jnp.clip(column, 0), 1)
+    return (jnp.abs(there - place) <= design.left_right_max_diff_px) | (column < 0)
 
 
 def drop_speckles(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Float[Array, "H W"]:
-    """Without blobs of few pixels."""
-    return disparity_px
+    """Without blobs of few pixels: they are mostly false, and what stands on the ground is no blob."""
+    most = design.speckle_window_px
+    if most is None:
+        most = max(round(disparity_px.size * _SPECKLE_SHARE), _LEAST_SPECKLE_PX)
+    return drop_blobs(disparity_px, design.speckle_range_px, most) if most else disparity_px
 
 
 def drop_edges(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Float[Array, "H W"]:
-    """Without pixels near a step of disparity."""
+    """Without pixels near a step of disparity: there, rocks are smeared over the ground behind."""
     if not design.edge_step_px:
         return disparity_px
-    window = (design.edge_window_px,) * 2
-    unknown = jnp.isnan(disparity_px)
-    least = jax.lax.reduce_window(
-        jnp.where(unknown, jnp.inf, disparity_px), jnp.inf, jax.lax.min, window, (1, 1), "same"
-    )
-    most = jax.lax.reduce_window(
-        jnp.where(unknown, -jnp.inf, disparity_px), -jnp.inf, jax.lax.max, window, (1, 1), "same"
-    )
-    return jnp.where(most - least > design.edge_step_px, jnp.nan, disparity_px)
+    window, unknown = (design.edge_window_px,) * 2, jnp.isnan(disparity_px)
+    near = jnp.where(unknown, jnp.inf, disparity_px)
+    far = jnp.where(unknown, -jnp.inf, disparity_px)
+    for axis in (0, 1):
+        window = tuple(design.edge_window_px if axis == one else 1 for one in (0, 1))
+        near = jax.lax.reduce_window(near, jnp.inf, jax.lax.min, window, (1, 1), "same")
+        far = jax.lax.reduce_window(far, -jnp.inf, jax.lax.max, window, (1, 1), "same")
+    return jnp.where(far - near > design.edge_step_px, jnp.nan, disparity_px)
