@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
@@ -28,6 +29,7 @@ from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible,
 from jaxmap.labels import IGNORE
 from jaxmap.matching.design import MatchDesign, MatchParams
 from jaxmap.matching.match import match
+from jaxmap.matching.rectify import RawPair, rectify_pair, rectifying_rotations
 from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_voxel_map
 
 Arguments = ParamSpec("Arguments")
@@ -40,7 +42,7 @@ class MapperParams:
     """All the numbers the step depends on; every leaf is differentiable.
 
     `labeller` are `Labeller.params`, `ensemble` the numbers of an ensemble's members, where the mapper has any; `match`
-    those of stereo matching, where the step matches.
+    those of stereo matching, where the step matches, and `raw` the calibration of the images, where it rectifies them.
     """
 
     camera: StereoCamera
@@ -48,6 +50,7 @@ class MapperParams:
     labeller: LabellerParams = NO_NUMBERS
     ensemble: EnsembleParams | None = None
     match: MatchParams | None = None
+    raw: RawPair | None = None
 
 
 class StepReport(NamedTuple):
@@ -104,13 +107,14 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
 class FrameEvidence(NamedTuple):
     """What one frame says, before it is added to a map.
 
-    `evidence` is that of the voxels of `window`; `frame` is itself, matched; `labels` are those that its points are
-    fused with; `heights` are the statistics of the columns of the window, where they are kept.
+    `evidence` is that of the voxels of `window`; `frame` is itself, matched, and `camera` sees it; `labels` are those
+    that its points are fused with; `heights` are the statistics of the columns of the window, where they are kept.
     """
 
     evidence: Float[Array, "C1 X Y Z"]
     window: GridSpec
     frame: Frame
+    camera: StereoCamera
     labels: PointLabels
     report: StepReport
     heights: Float[Array, "4 X Y"] | None = None
@@ -127,7 +131,7 @@ def fuse_frame(
     if design.members:
         assert params.ensemble is not None
         rule, depth_range_m, shape = design.rule, design.depth_range_m, design.window_shape
-        camera, draws = params.camera, params.ensemble
+        camera, draws = seen.camera, params.ensemble
         own = fuse_members(voxel_map, seen.frame, seen.labels, camera, draws, frame_key, rule, depth_range_m, shape)
         fused = replace(fused, members=own)
     if voxel_map.surface is not None and seen.heights is not None:
@@ -141,10 +145,10 @@ def see_frame(
 ) -> FrameEvidence:
     """What a frame says of the voxels of a grid that it can see: all of the step but the sum."""
     labeller, rule, depth_range_m = design.labeller, design.rule, design.depth_range_m
-    camera, pose, fusion = params.camera, frame.T_world_camera, params.fusion
+    frame, camera = matched(design.match, frame, params)
+    pose, fusion = frame.T_world_camera, params.fusion
 
-    disparity_px = disparity_of(design.match, frame, params.match)
-    cloud = project(camera, pose, disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
+    cloud = project(camera, pose, frame.matched_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
     labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
@@ -168,18 +172,48 @@ def see_frame(
         voxels_freed=freed,
         estimate=estimate,
     )
-    matched = replace(frame, disparity_px=disparity_px)
-    return FrameEvidence(frame_evidence(counts, free, fusion, rule), window, matched, labels, report, heights)
+    evidence = frame_evidence(counts, free, fusion, rule)
+    return FrameEvidence(evidence, window, frame, camera, labels, report, heights)
 
 
-def disparity_of(design: MatchDesign | None, frame: Frame, params: MatchParams | None) -> Float[Array, "H W"]:
-    """The disparity of a frame: as it brings it or, with a design, as its images match."""
+def matched(design: MatchDesign | None, frame: Frame, params: MapperParams) -> tuple[Frame, StereoCamera]:
+    """The frame as the rest of the step takes it, with its disparity, and the rectified camera that sees it.
+
+    The disparity is the frame's own or, with a design, that of its images, which are rectified before where the
+    params hold the calibration of a raw pair.
+    """
     if design is None:
-        return frame.matched_px
-    assert frame.image is not None and frame.right_image is not None and params is not None
+        return frame, params.camera
+    frame, camera = rectified(design, frame, params)
+    assert frame.image is not None and frame.right_image is not None and params.match is not None
     with jax.named_scope("match"):
-        disparity_px = match(design, frame.image, frame.right_image, params)
-    return disparity_px if frame.blind is None else jnp.where(frame.blind, jnp.nan, disparity_px)
+        disparity_px = match(design, frame.image, frame.right_image, params.match)
+    if frame.blind is not None:
+        disparity_px = jnp.where(frame.blind, jnp.nan, disparity_px)
+    return replace(frame, disparity_px=disparity_px), camera
+
+
+def rectified(design: MatchDesign, frame: Frame, params: MapperParams) -> tuple[Frame, StereoCamera]:
+    """The frame with rectified images, and the camera, whose baseline is that of the raw pair where there is one.
+
+    The pose of a frame with raw images is that of the raw left camera.
+    """
+    raw, camera = params.raw, params.camera
+    if raw is None:
+        return frame, camera
+    assert frame.image is not None and frame.right_image is not None
+    with jax.named_scope("rectify"):
+        pair = rectify_pair(raw, camera, frame.image, frame.right_image)
+        # Gradients pass through fractions of grey levels alone.
+        left, right = (
+            image if design.soft else jnp.round(image).astype(jnp.uint8) for image in (pair.left, pair.right)
+        )
+        R_rectified_raw, _ = rectifying_rotations(raw)
+        pose = frame.T_world_camera @ jaxlie.SE3.from_rotation(R_rectified_raw.inverse())
+        blind = ~pair.left_seen if frame.blind is None else frame.blind | ~pair.left_seen
+        baseline_m = jnp.linalg.norm(raw.T_right_left.translation())
+    frame = replace(frame, T_world_camera=pose, image=left, right_image=right, blind=blind)
+    return frame, replace(camera, baseline_m=baseline_m)
 
 
 def _count_voxels(
@@ -215,11 +249,11 @@ def label_image(
     """The labels that the step gives the pixels of the frame when `number` frames were fused before it."""
     frame_key = jax.random.fold_in(key, number)
     sigma_px, ground = params.fusion.disparity_sigma_px, design.labeller.ground
-    disparity_px = disparity_of(design.match, frame, params.match)
-    cloud = project(params.camera, frame.T_world_camera, disparity_px, design.depth_range_m, sigma_px, ground)
+    frame, camera = matched(design.match, frame, params)
+    cloud = project(camera, frame.T_world_camera, frame.matched_px, design.depth_range_m, sigma_px, ground)
     labels = harden(label_points(design.labeller, frame, cloud, params.labeller, frame_key)[0])
     assert labels.labels is not None
-    return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(disparity_px.shape)
+    return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(cloud.valid.shape)
 
 
 Step = Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepReport]]
@@ -276,7 +310,8 @@ def make_mapper(
         members: of an ensemble that is fused beside the map; its params then hold `ensemble`, its frames
             `pose_errors`.
         match: how the step matches the images of a frame (`image` and `right_image`); its params then hold `match`.
-            Without it, frames bring their disparity.
+            Without it, frames bring their disparity. With `raw` (`stereo.rectify.make_raw_pair`) in its params as well,
+            the images are raw, and the pose of a frame is that of the raw left camera.
         T_world_camera: the poses of all frames, where they are known beforehand: the windows then are no larger
             than these need. What a frame of another pose sees beyond its window is left out.
 

@@ -55,6 +55,7 @@ def matched(design: MatchDesign, frame: Frame) -> Frame:
     return Frame(jnp.asarray(disparity_px), frame.T_world_camera)
 
 
+@pytest.mark.slow
 def test_the_step_of_two_images_is_matching_and_the_usual_step():
     mapper, usual = mapper_of(HARD), mapper_of(None)
     one, other = mapper.init(), usual.init()
@@ -68,6 +69,7 @@ def test_the_step_of_two_images_is_matching_and_the_usual_step():
     assert mapper.compilations() == 1
 
 
+@pytest.mark.slow
 def test_what_is_blind_is_not_seen():
     mapper = mapper_of(HARD)
     frame = frame_of()
