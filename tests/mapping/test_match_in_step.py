@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from scenes import BASELINE_M, CX_PX, CY_PX, F_PX, scene_frame
+from rigs import RIG
+from scenes import BASELINE_M, CX_PX, CY_PX, F_PX, SceneFrame, raw_frame, scene_frame
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.options import FusionRule
@@ -19,6 +20,10 @@ from jaxmap.mapping.devices import _seen_nothing
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
 from jaxmap.matching.design import MatchDesign, make_match_params
 from jaxmap.matching.match import match
+from jaxmap.matching.rectify import RawPair
+from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.match import StereoOptions
+from jaxmap.stereo.rectify import make_raw_pair, make_rectifier
 from jaxmap.types import Frame, make_grid, make_stereo_camera
 
 TOP, LEFT, HEIGHT_PX, WIDTH_PX = 62, 30, 36, 72
@@ -119,3 +124,49 @@ def test_frames_that_cannot_be_matched_are_refused(design, change, message):
     mapper = mapper_of(design)
     with pytest.raises(JaxmapError, match=message):
         mapper.step(mapper.init(), replace(frame_of(), **change), PARAMS, KEY)
+
+
+def raw_frame_of(rig_frame: SceneFrame) -> Frame:
+    pose = jaxlie.SE3.from_matrix(jnp.asarray(rig_frame.T_world_camera, jnp.float32))
+    return Frame(None, pose, image=jnp.asarray(rig_frame.left), right_image=jnp.asarray(rig_frame.right))
+
+
+@pytest.mark.slow
+def test_raw_images_are_rectified_within_the_step():
+    design, seen = replace(HARD, num_disparities=32), raw_frame(RIG, 0)
+    front_end = StereoFrontEnd(RIG, StereoOptions())
+    mapper = make_mapper(front_end.camera, GRID, make_no_labeller(), FusionRule(), (0.3, 4.0), match=design)
+    params = replace(PARAMS, camera=front_end.camera)
+    ready = front_end.ready(seen.left, seen.right)
+    T_rectified = jnp.asarray(seen.T_world_camera @ front_end.T_raw_rectified, jnp.float32)
+    before = Frame(
+        None,
+        jaxlie.SE3.from_matrix(T_rectified),
+        image=jnp.asarray(ready.left),
+        right_image=jnp.asarray(ready.right),
+        blind=jnp.asarray(ready.blind),
+    )
+    within, _ = mapper.step(mapper.init(), raw_frame_of(seen), replace(params, raw=make_raw_pair(RIG)), KEY)
+    on_host, _ = mapper.step(mapper.init(), before, params, KEY)
+    # OpenCV rounds places in the raw image to 32nds of a pixel.
+    one, other = (np.asarray(made.log_odds)[0] > 0.5 for made in (within, on_host))
+    assert other.sum() > 200 and (one & other).sum() > 0.9 * (one | other).sum()
+
+
+@pytest.mark.slow
+def test_a_score_of_the_map_has_gradients_in_the_calibration():
+    camera, seen = make_rectifier(RIG).camera, raw_frame(RIG, 0)
+    small = replace(camera, cx_px=camera.cx_px - LEFT, cy_px=camera.cy_px - TOP, width_px=WIDTH_PX, height_px=HEIGHT_PX)
+    mapper = make_mapper(small, GRID, make_no_labeller(), FusionRule(), (0.3, 4.0), match=SOFT)
+    weight = np.random.default_rng(9).normal(size=mapper.init().log_odds.shape)
+
+    @jax.jit
+    @jax.grad
+    def gradient(raw: RawPair) -> jax.Array:
+        params = replace(PARAMS, camera=small, raw=raw)
+        return (weight * jnp.tanh(mapper.fuse(mapper.init(), raw_frame_of(seen), params, KEY)[0].log_odds)).sum()
+
+    found = gradient(make_raw_pair(RIG))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    for leaf in (found.left.fx_px, found.right.cx_px, found.right.distortion, found.T_right_left.wxyz_xyz):
+        assert np.abs(leaf).max() > 0
