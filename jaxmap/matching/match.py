@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Num
 
 from jaxmap.matching.aggregate import aggregate_planes
 from jaxmap.matching.costs import cost_planes
-from jaxmap.matching.design import MatchDesign, MatchParams
+from jaxmap.matching.design import MOST_P1, MOST_P2, MatchDesign, MatchParams
 from jaxmap.matching.select import decide, winners
 
 _SUBPIXELS = 16
@@ -35,10 +35,11 @@ def match(
 
 
 def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
-    """The penalties in the units of the volume of costs."""
+    """The penalties in the units of the volume of costs; where they are small integers, at most what 8 bits hold."""
     if design.soft:
         return params.p1, params.p2
-    p1, p2 = (jnp.round(p * design.cost_steps).astype(jnp.uint8) for p in (params.p1, params.p2))
+    steps = (jnp.clip(params.p1, 0, MOST_P1), jnp.clip(params.p2, 0, MOST_P2))
+    p1, p2 = (jnp.round(penalty * design.cost_steps).astype(jnp.uint8) for penalty in steps)
     return p1, p2
 
 

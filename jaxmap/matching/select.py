@@ -24,8 +24,7 @@ class Winners(NamedTuple):
         second: the least cost of a disparity that is not its neighbour.
         lower: the cost of the disparity before it; its own where there is none.
         higher: likewise of the one after it.
-        other: the cheapest disparity of the column x + `min_disparity_px` of the right image, for W + D values of x
-            from the least of `min_disparity_px` and 0.
+        other: the cheapest disparity of the right image, whose column u stands at u + `min_disparity_px` + D - 1.
     """
 
     place: Int[Array, "*H W"]
@@ -43,16 +42,24 @@ def select(design: MatchDesign, total: Num[Array, "H W D"], params: MatchParams)
 
 def winners(total: Num[Array, "D W"]) -> Winners:
     """The winners of a row of pixels."""
-    count, width = total.shape
+    count, _width = total.shape
     cost = least(total)
     place = _place(total, cost)
     apart = jnp.abs(jnp.arange(count, dtype=place.dtype)[:, None] - place) > 1
     second = least(jnp.where(apart, total, _most(total)))
     lower, higher = (jnp.take_along_axis(total, jnp.clip(place + step, 0, count - 1)[None], 0)[0] for step in (-1, 1))
-    # A column of the right image sees disparity d at column x + d of the left one: d places on in row d.
-    wide = jnp.pad(total, ((0, 0), (0, count)), constant_values=_most(total)).reshape(-1)
-    skewed = jnp.pad(wide, (0, count), constant_values=_most(total)).reshape(count, width + count + 1)
-    return Winners(place, cost, second, lower, higher, _place(skewed[:, :width], least(skewed[:, :width])))
+    from_right = _from_right(total)
+    return Winners(place, cost, second, lower, higher, _place(from_right, least(from_right)))
+
+
+def _from_right(total: Num[Array, "D W"]) -> Num[Array, "D W_D"]:
+    """The same by the column that was matched: row d is moved d places to the left."""
+    count, width = total.shape
+    most = _most(total)
+    wide = jnp.pad(total, ((0, 0), (count - 1, count)), constant_values=most)
+    # Read with rows that are longer by one, each row begins one place later.
+    longer = jnp.pad(wide.reshape(-1), (0, count), constant_values=most).reshape(count, width + 2 * count)
+    return longer[:, : width + count - 1]
 
 
 def _place(total: Num[Array, "D W"], cost: Num[Array, "W"]) -> Int[Array, "W"]:
@@ -71,7 +78,7 @@ def decide(design: MatchDesign, winner: Winners, params: MatchParams) -> Float[A
     place = winner.place.astype(jnp.int32)
     match_column = jnp.arange(width) - design.min_disparity_px - place
     good = (match_column >= 0) & (match_column < width)
-    good &= winner.second.astype(jnp.float32) * (1 - params.uniqueness) >= winner.cost.astype(jnp.float32)
+    good &= winner.second.astype(jnp.float32) * (1 - params.uniqueness) > winner.cost.astype(jnp.float32)
     if design.left_right_max_diff_px >= 0:
         good &= _agrees(design, place, winner.other)
     disparity_px = jnp.where(good, design.min_disparity_px + between_pixels(design, winner), jnp.nan)
@@ -90,9 +97,8 @@ def between_pixels(design: MatchDesign, winner: Winners) -> Float[Array, "H W"]:
 
 def _agrees(design: MatchDesign, place: Int[Array, "H W"], other: Int[Array, "H W"]) -> Bool[Array, "H W"]:
     """Whether the pixel of the right image that was matched prefers about the same disparity."""
-    column = jnp.arange(place.shape[1]) - place
-    there = jnp.take_along_axis(other, jnp.clip(column, 0), 1)
-    return (jnp.abs(there - place) <= design.left_right_max_diff_px) | (column < 0)
+    matched = jnp.arange(place.shape[1]) - place + design.num_disparities - 1
+    return jnp.abs(jnp.take_along_axis(other, matched, 1) - place) <= design.left_right_max_diff_px
 
 
 def drop_speckles(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Float[Array, "H W"]:
