@@ -84,6 +84,10 @@ def select(total: np.ndarray, first: int, uniqueness: float, left_right: float) 
     """Disparities, NaN where the winner is not unique or the right image disagrees."""
     height, width, count = total.shape
     disparity_px = np.full((height, width), np.nan)
+    other_costs: dict[tuple[int, int], list[tuple[float, int]]] = {}
+    for v, u in np.ndindex(height, width):
+        best = int(total[v, u].argmin())
+        other_costs.setdefault((v, u - first - best), []).append((total[v, u, best], best))
     for v, u in np.ndindex(height, width):
         costs = total[v, u]
         best = int(costs.argmin())
@@ -91,8 +95,7 @@ def select(total: np.ndarray, first: int, uniqueness: float, left_right: float) 
         far = [costs[d] for d in range(count) if abs(d - best) > 1]
         if not 0 <= other < width or (far and min(far) * (1 - uniqueness) <= costs[best]):
             continue
-        seen = {d: total[v, other + first + d, d] for d in range(count) if 0 <= other + first + d < width}
-        if left_right >= 0 and abs(min(seen, key=lambda d: seen[d]) - best) > left_right:
+        if left_right >= 0 and abs(min(other_costs[v, other])[1] - best) > left_right:
             continue
         offset = 0.0
         if 0 < best < count - 1:

@@ -24,7 +24,6 @@ class Winners(NamedTuple):
         second: the least cost of a disparity that is not its neighbour.
         lower: the cost of the disparity before it; its own where there is none.
         higher: likewise of the one after it.
-        other: the cheapest disparity of the right image, whose column u stands at u + `min_disparity_px` + D - 1.
     """
 
     place: Int[Array, "*H W"]
@@ -32,7 +31,6 @@ class Winners(NamedTuple):
     second: Num[Array, "*H W"]
     lower: Num[Array, "*H W"]
     higher: Num[Array, "*H W"]
-    other: Int[Array, "*H W_D"]
 
 
 def select(design: MatchDesign, total: Num[Array, "H W D"], params: MatchParams) -> Float[Array, "H W"]:
@@ -48,18 +46,7 @@ def winners(total: Num[Array, "D W"]) -> Winners:
     apart = jnp.abs(jnp.arange(count, dtype=place.dtype)[:, None] - place) > 1
     second = least(jnp.where(apart, total, _most(total)))
     lower, higher = (jnp.take_along_axis(total, jnp.clip(place + step, 0, count - 1)[None], 0)[0] for step in (-1, 1))
-    from_right = _from_right(total)
-    return Winners(place, cost, second, lower, higher, _place(from_right, least(from_right)))
-
-
-def _from_right(total: Num[Array, "D W"]) -> Num[Array, "D W_D"]:
-    """The same by the column that was matched: row d is moved d places to the left."""
-    count, width = total.shape
-    most = _most(total)
-    wide = jnp.pad(total, ((0, 0), (count - 1, count)), constant_values=most)
-    # Read with rows that are longer by one, each row begins one place later.
-    longer = jnp.pad(wide.reshape(-1), (0, count), constant_values=most).reshape(count, width + 2 * count)
-    return longer[:, : width + count - 1]
+    return Winners(place, cost, second, lower, higher)
 
 
 def _place(total: Num[Array, "D W"], cost: Num[Array, "W"]) -> Int[Array, "W"]:
@@ -80,7 +67,7 @@ def decide(design: MatchDesign, winner: Winners, params: MatchParams) -> Float[A
     good = (match_column >= 0) & (match_column < width)
     good &= winner.second.astype(jnp.float32) * (1 - params.uniqueness) > winner.cost.astype(jnp.float32)
     if design.left_right_max_diff_px >= 0:
-        good &= _agrees(design, place, winner.other)
+        good &= agrees(place, winner.cost, match_column, design.left_right_max_diff_px)
     disparity_px = jnp.where(good, design.min_disparity_px + between_pixels(design, winner), jnp.nan)
     disparity_px = drop_speckles(design, disparity_px)
     return drop_edges(design, disparity_px)
@@ -95,10 +82,22 @@ def between_pixels(design: MatchDesign, winner: Winners) -> Float[Array, "H W"]:
     return winner.place + jnp.where(has_both, offset, 0)
 
 
-def _agrees(design: MatchDesign, place: Int[Array, "H W"], other: Int[Array, "H W"]) -> Bool[Array, "H W"]:
-    """Whether the pixel of the right image that was matched prefers about the same disparity."""
-    matched = jnp.arange(place.shape[1]) - place + design.num_disparities - 1
-    return jnp.abs(jnp.take_along_axis(other, matched, 1) - place) <= design.left_right_max_diff_px
+def agrees(
+    place: Int[Array, "H W"], cost: Num[Array, "H W"], match_column: Int[Array, "H W"], most_apart: float
+) -> Bool[Array, "H W"]:
+    """Whether the match, a pixel of the right image, has about the same disparity.
+
+    Its disparity is that of the cheapest of all winners that lead to it, as OpenCV has it.
+    """
+    row, width = jnp.arange(place.shape[0])[:, None], place.shape[1]
+    # Negative columns would be counted from the end.
+    match_column = jnp.where(match_column < 0, width, match_column)
+    least_cost = jnp.full(place.shape, _most(cost), cost.dtype).at[row, match_column].min(cost, mode="drop")
+    is_cheapest = cost == least_cost[row, match_column]
+    far = jnp.iinfo(place.dtype).max
+    other = jnp.full(place.shape, far, place.dtype)
+    other = other.at[row, match_column].min(jnp.where(is_cheapest, place, far), mode="drop")
+    return jnp.abs(other[row, match_column] - place) <= most_apart
 
 
 def drop_speckles(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Float[Array, "H W"]:
