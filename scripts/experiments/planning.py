@@ -29,7 +29,7 @@ from jaxmap.datasets.rasters import read_heights, read_window
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.surface import Surface
 from jaxmap.geometry.grid import exact_corner
-from jaxmap.mapping.store import MapAttributes
+from jaxmap.mapping.store import MapAttributes, in_memory
 from jaxmap.planning.ground import Ground
 from jaxmap.planning.options import RoverOptions
 from jaxmap.runs.config import MapConfig
