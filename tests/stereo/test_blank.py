@@ -12,7 +12,7 @@ from jaxmap.stereo.blank import STEP_PX, blank_reason
 RNG = np.random.default_rng(0)
 
 
-@given(seed=st.integers(0, 2**32 - 1), low=st.integers(0, 255), span=st.integers(0, 12), colours=st.sampled_from([1, 3]))
+@given(st.integers(0, 2**32 - 1), st.integers(0, 255), st.integers(0, 12), st.sampled_from([1, 3]))
 def test_the_levels_are_those_of_numpys_percentiles(seed, low, span, colours):
     random = np.random.default_rng(seed)
     size = (*random.integers(1, 40, 2), colours)[: 2 if colours == 1 else 3]
