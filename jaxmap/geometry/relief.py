@@ -7,6 +7,7 @@ the cells of the ground turn and move with the camera (`geometry.ground`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -136,7 +137,7 @@ def relief_channels(relief: Relief) -> Float[Array, "h w 6"]:
     return jnp.stack([channel * known for channel in channels], axis=-1)
 
 
-def to_pixels(image: Shaped[Array, "h w *c"], image_px: tuple[int, int]) -> Shaped[Array, "H W *c"]:
+def to_pixels(image: Shaped[Array, "h w *c"], image_px: Sequence[int]) -> Shaped[Array, "H W *c"]:
     """An image of relief at the pixels of the disparity, whose height and width are given."""
     fine = jnp.repeat(jnp.repeat(image, RELIEF_STRIDE, axis=0), RELIEF_STRIDE, axis=1)
     return fine[: image_px[0], : image_px[1]]

@@ -10,21 +10,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pyspng
+from isal import isal_zlib
 from jaxtyping import UInt8, UInt16
 from PIL import ImageFile, PngImagePlugin
 
-try:
-    import pyspng
-    from isal import isal_zlib
-except ImportError:  # rare machines have neither
-    isal_zlib = pyspng = None
-
-_SAMPLES = {"L": 1, "I": 1, "RGB": 3, "RGBA": 4}
-"""Of a pixel, by how Pillow calls the pixels in the file; ;16B follows where they have 16 bits."""
+_KINDS = {"L": (0, 1), "I": (0, 1), "RGB": (2, 3), "RGBA": (6, 4)}
+"""Type of the colours and samples of a pixel, by how Pillow calls the pixels in the file; ;16B follows for 16 bits."""
 _MOST_PX = 2**24
 """Larger pictures are decoded by Pillow, which holds no more than the pixels at once."""
-_HEADER_BYTES, _STORED_BYTES = 33, 65_535
-"""Signature and first chunk of a PNG; the most that a block holds that is not compressed."""
+_STORED_BYTES = 65_535
+"""The most that a block holds that is not compressed."""
 
 
 def plain_png(
@@ -36,24 +32,26 @@ def plain_png(
         picture: opened, not yet decoded.
         path: its file.
     """
-    if isal_zlib is None or not isinstance(picture, PngImagePlugin.PngImageFile) or len(picture.tile) != 1:
+    if not isinstance(picture, PngImagePlugin.PngImageFile) or len(picture.tile) != 1:
         return None
     _, _, start, raw_mode = picture.tile[0]
     kind, _, deep = str(raw_mode).partition(";")
-    if kind not in _SAMPLES or deep not in ("", "16B") or picture.info.get("interlace") or picture.is_animated:
+    if kind not in _KINDS or deep not in ("", "16B") or picture.info.get("interlace") or picture.is_animated:
         return None
     width, height = picture.size
     if width * height > _MOST_PX:
         return None
-    row_bytes = 1 + width * _SAMPLES[kind] * (2 if deep else 1)
+    bits, (colours, samples) = 16 if deep else 8, _KINDS[kind]
+    expected_bytes = height * (1 + width * samples * bits // 8)
     data = path.read_bytes()
     try:
         inflating = isal_zlib.decompressobj()
-        filtered = inflating.decompress(b"".join(_compressed(data, start)), height * row_bytes + 1)
-        if not inflating.eof or len(filtered) != height * row_bytes:
+        rows = inflating.decompress(b"".join(_compressed(data, start)), expected_bytes + 1)
+        if not inflating.eof or len(rows) != expected_bytes:
             return None
-        pixels = pyspng.load(_uncompressed(data[:_HEADER_BYTES], filtered))
-    except (isal_zlib.error, EOFError, RuntimeError, struct.error):
+        header = struct.pack(">IIBBBBB", width, height, bits, colours, 0, 0, 0)
+        pixels = pyspng.load(_uncompressed(header, rows))
+    except Exception:  # of either library; Pillow says what is wrong
         return None
     if pixels.ndim == 3:
         # Alpha goes, which libspng also gives to pixels of 16 bits that have none.
@@ -70,15 +68,16 @@ def _compressed(data: bytes, start: int) -> Iterator[memoryview]:
         start += length + 12
 
 
-def _uncompressed(header: bytes, filtered: bytes) -> bytes:
+def _uncompressed(header: bytes, rows: bytes) -> bytes:
     """A PNG of these rows, not compressed: its decoder has nothing left to do but to undo their filters."""
-    view, parts = memoryview(filtered), [b"\x78\x01"]
-    for start in range(0, len(filtered), _STORED_BYTES):
+    view, parts = memoryview(rows), [b"\x78\x01"]
+    for start in range(0, len(rows), _STORED_BYTES):
         block = view[start : start + _STORED_BYTES]
-        last = start + len(block) == len(filtered)
+        last = start + len(block) == len(rows)
         parts += [struct.pack("<BHH", last, len(block), len(block) ^ 0xFFFF), block]
-    parts.append(struct.pack(">I", isal_zlib.adler32(filtered)))
-    return b"".join([header, *_chunk(b"IDAT", *parts), *_chunk(b"IEND")])
+    parts.append(struct.pack(">I", isal_zlib.adler32(rows)))
+    chunks = (*_chunk(b"IHDR", header), *_chunk(b"IDAT", *parts), *_chunk(b"IEND"))
+    return b"".join((b"\x89PNG\r\n\x1a\n", *chunks))
 
 
 def _chunk(name: bytes, *parts: bytes | memoryview) -> list[bytes | memoryview]:

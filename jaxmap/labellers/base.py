@@ -39,7 +39,7 @@ class FeatureMap(Protocol):
         ...
 
 
-def dense_features(values: Shaped[Array, "N D"], image_px: tuple[int, int]) -> FeatureMap:
+def dense_features(values: Shaped[Array, "N D"], image_px: Sequence[int]) -> FeatureMap:
     """The map of features that are held as an array, of the pixels of an image (height, width)."""
 
     def map_dense(function: Pointwise, more: Float[Array, "h w E"] | None = None) -> tuple[Array, ...]:

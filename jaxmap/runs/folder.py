@@ -239,7 +239,8 @@ def write_key_frame(
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
     # Noise does not compress: more effort takes twice to four times as long and saves little.
-    ending, effort = ("png", dict(compress_level=1)) if large else ("webp", dict(quality=80, method=2))
+    ending = "png" if large else "webp"
+    effort: dict[str, Any] = dict(compress_level=1) if large else dict(quality=80, method=2)
     for kind, picture in pictures.items():
         height, width = picture.shape[:2]
         shrink = _SMALL_PX / max(height, width)

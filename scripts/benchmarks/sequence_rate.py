@@ -162,7 +162,8 @@ class Run:
         with spent.stage("near guard"):
             front_end.near_guard(left, right)
         with spent.stage("hand over"):
-            to_device(as_rgb(left)), to_device(prepared.rectified.disparity_px)
+            to_device(as_rgb(left))
+            to_device(prepared.rectified.disparity_px)
         with spent.stage("step"):
             self.voxel_map, info = self.mapper.step(self.voxel_map, frame, plan.params, plan.key)
             jax.block_until_ready(self.voxel_map.log_odds)

@@ -121,10 +121,11 @@ def test_padding_matches_the_leftmost_columns_too():
     assert (np.abs(padded - plain)[both] < 0.5).mean() > 0.98
 
 
-def test_pixels_near_a_step_of_disparity_are_dropped_and_no_others():
-    every = matched(5)
+@pytest.mark.parametrize("least_px", [0, -16])
+def test_pixels_near_a_step_of_disparity_are_dropped_and_no_others(least_px):
+    every = matched(5, min_disparity_px=least_px)
     size, step_px = 5, 2.0
-    left = matched(5, edge_window_px=size, edge_step_px=step_px)
+    left = matched(5, min_disparity_px=least_px, edge_window_px=size, edge_step_px=step_px)
     padded = np.pad(every, size // 2, constant_values=np.nan)
     near = np.lib.stride_tricks.sliding_window_view(padded, (size, size)).reshape(*every.shape, -1)
     known = np.isfinite(near).any(axis=-1)
