@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ import jaxlie
 import numpy as np
 import numpy.typing as npt
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8
 
 from jaxmap.errors import JaxmapError
 
@@ -30,6 +30,10 @@ MOST_VOXELS_ALONG = 2**23
 MOST_CAMERA_PX, MOST_BASELINE_M = 1e6, 1e4
 """Focal lengths and principal points, and baselines, beyond these are mistakes; float32 must hold their products."""
 _LEAST = 1e-6
+
+
+DistortionModel = Literal["opencv", "equidistant"]
+"""How a lens bends rays: OpenCV's usual model, or that of a fisheye."""
 
 
 def _static() -> dict[str, bool]:
@@ -124,19 +128,34 @@ def pinhole(camera: StereoCamera) -> Pinhole:
 class Frame:
     """One stereo frame, ready for the compiled step.
 
-    `disparity_px` is NaN where the matcher found nothing; `image` is the rectified left one, grey or RGB; `logits`
-    are what a network has made of it, at its own resolution. One of the next four is present where the labeller asks
-    for it, so that every frame of a sequence has the same structure; `pose_errors` are those of the members of an
-    ensemble, where there is one (`ensemble.draws.draw_pose_errors`).
+    `disparity_px` is NaN where the matcher found nothing; it is None where the step itself matches `image` with
+    `right_image`, but for the pixels that are `blind`: those have no disparity, whatever the images show. `image` is
+    the rectified left one, grey or RGB; `logits` are what a network has made of it, at its own resolution. One of
+    `image`, `labels`, `class_probabilities` and `logits` is present where the labeller asks for it, so that every frame
+    of a sequence has the same structure; `pose_errors` are those of the members of an ensemble, where there is one
+    (`ensemble.draws.draw_pose_errors`).
     """
 
-    disparity_px: Float[Array, "H W"]
+    disparity_px: Float[Array, "H W"] | None
     T_world_camera: jaxlie.SE3
-    image: UInt8[Array, "H W *rgb"] | None = None
+    image: Shaped[Array, "H W *rgb"] | None = None
     labels: UInt8[Array, "H W"] | None = None
     class_probabilities: Float[Array, "H W C"] | None = None
     logits: Float[Array, "h w C"] | None = None
     pose_errors: Float[Array, "M 6"] | None = None
+    right_image: Shaped[Array, "H W *rgb"] | None = None
+    blind: Bool[Array, "H W"] | None = None
+
+    @property
+    def matched_px(self) -> Float[Array, "H W"]:
+        """The disparity that the frame brings.
+
+        Raises:
+            JaxmapError: it brings none; its images were to be matched within the step.
+        """
+        if self.disparity_px is None:
+            raise JaxmapError("the frame has no disparity", where="Frame", fix="match its images first")
+        return self.disparity_px
 
 
 @jax.tree_util.register_dataclass

@@ -15,9 +15,12 @@ FLOORS = (
     "host",
     # pure geometry
     "geometry localisation",
-    "models stereo fusion profiling",
-    # what labels points, what doubts a map, what matches pairs inside the step, what reads logs
-    "labellers ensemble matching datasets",
+    "models fusion profiling",
+    # stereo matching in JAX, and the host's front end, which offers it beside OpenCV's
+    "matching",
+    "stereo",
+    # what labels points, what doubts a map, what reads logs
+    "labellers ensemble datasets",
     # the compiled step, what feeds it, and the map on disk
     "mapping",
     # what is built on maps

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxmap.stereo.match import StereoOptions
 from jaxmap.types import to_device
 
 Cost = Literal["census", "bt", "mccnn"]
@@ -96,34 +95,3 @@ def make_match_params(
     numbers = {"p1": least if p1 is None else p1, "p2": most if p2 is None else p2}
     numbers |= {"uniqueness": uniqueness, "temperature": temperature}
     return MatchParams(**{k: to_device(v, np.float32) for k, v in numbers.items()}, cost=weights or {})
-
-
-def match_params(options: StereoOptions, weights: Any = None) -> MatchParams:
-    """The numbers that the options of stereo name; `weights` are those of the cost network."""
-    cost = "mccnn" if options.matcher == "mccnn" else options.cost
-    return make_match_params(
-        cost,
-        p1=options.step_penalty,
-        p2=options.jump_penalty,
-        uniqueness=options.uniqueness_ratio / 100,
-        temperature=options.temperature,
-        weights=weights,
-    )
-
-
-def match_design(options: StereoOptions, width_px: int) -> MatchDesign:
-    """The design that the options of stereo name, for images of this width."""
-    return MatchDesign(
-        cost="mccnn" if options.matcher == "mccnn" else options.cost,
-        min_disparity_px=options.min_disparity_px,
-        num_disparities=options.num_disparities or -(-width_px // (8 * 16)) * 16,
-        paths=options.paths,
-        soft=options.soft,
-        block_size=options.block_size if options.cost == "bt" else 1,
-        pre_filter_cap=options.pre_filter_cap,
-        left_right_max_diff_px=options.left_right_max_diff_px,
-        speckle_window_px=options.speckle_window,
-        speckle_range_px=options.speckle_range_px,
-        edge_step_px=options.edge_step_px,
-        edge_window_px=options.edge_window_px,
-    )

@@ -10,11 +10,16 @@ from jaxmap.matching.costs import cost_planes
 from jaxmap.matching.design import MOST_P1, MOST_P2, MatchDesign, MatchParams
 from jaxmap.matching.select import decide, winners
 
+_SUBPIXELS = 16
+
 
 def match(
     design: MatchDesign, left: Num[Array, "H W *rgb"], right: Num[Array, "H W *rgb"], params: MatchParams
 ) -> Float[Array, "H W"]:
     """Disparity of the left image in px, float32; NaN where it is unknown.
+
+    But in soft mode it is a multiple of 1/16, as OpenCV's are and as observations are kept: a map comes out the same
+    whichever way its frames went.
 
     Args:
         design: what is fixed before compiling.
@@ -25,7 +30,8 @@ def match(
     left, right = grey(left), grey(right)
     costs, turned = (cost_planes(design, left, right, turned=turned) for turned in (False, True))
     p1, p2 = penalties(design, params)
-    return decide(design, aggregate_planes(costs, turned, p1, p2, design.paths, winners), params)
+    disparity_px = decide(design, aggregate_planes(costs, turned, p1, p2, design.paths, winners), params)
+    return disparity_px if design.soft else jnp.round(disparity_px * _SUBPIXELS) / _SUBPIXELS
 
 
 def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
@@ -38,8 +44,11 @@ def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
 
 
 def grey(image: Num[Array, "H W *rgb"]) -> Num[Array, "H W"]:
-    """Luminance of an RGB image (ITU-R BT.601), rounded as OpenCV does where it holds integers."""
+    """Luminance of an RGB image (ITU-R BT.601); of integers in OpenCV's integer arithmetic, alike in any program."""
     if image.ndim == 2:
         return image
-    weighed = image.astype(jnp.float32) @ jnp.asarray([0.299, 0.587, 0.114], jnp.float32)
-    return jnp.floor(weighed + 0.5).astype(image.dtype) if jnp.issubdtype(image.dtype, jnp.integer) else weighed
+    red, green, blue = (image[..., channel] for channel in range(3))
+    if not jnp.issubdtype(image.dtype, jnp.integer):
+        return 0.299 * red + 0.587 * green + 0.114 * blue
+    red, green, blue = (channel.astype(jnp.int32) for channel in (red, green, blue))
+    return ((9798 * red + 19235 * green + 3735 * blue + (1 << 14)) >> 15).astype(image.dtype)

@@ -233,6 +233,7 @@ def write_key_frame(
     """
     from PIL import Image
 
+    assert rectified.disparity_px is not None
     pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)

@@ -227,14 +227,15 @@ def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
     truth_px = read(ref)
     if truth_px is None:
         return None
-    if truth_px.shape != rectified.disparity_px.shape:
-        size, expected = (f"{shape[1]}x{shape[0]}" for shape in (truth_px.shape, rectified.disparity_px.shape))
+    disparity_px = plan.front_end.disparity_of(rectified)
+    if truth_px.shape != disparity_px.shape:
+        size, expected = (f"{shape[1]}x{shape[0]}" for shape in (truth_px.shape, disparity_px.shape))
         raise JaxmapError(
             f"the true disparity is {size} px, the image {expected} px",
             where=f"frame {ref.name}",
             fix="give the truth of this image, or remove it",
         )
-    return score_disparity(rectified.disparity_px, truth_px)
+    return score_disparity(disparity_px, truth_px)
 
 
 def notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
@@ -363,11 +364,11 @@ class Pictures:
         plan = self.plan
         for prepared, number in self.waiting:
             assert prepared.frame is not None and prepared.rectified is not None
-            labels = None
+            rectified, labels = plan.front_end.matched(prepared.rectified), None
             if plan.labeller.classes:
                 labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
             large = plan.key_frames[prepared.index]
-            write_key_frame(self.folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
+            write_key_frame(self.folder, prepared.index, rectified, labels, plan.labeller.classes, large=large)
         self.waiting.clear()
 
 

@@ -32,6 +32,7 @@ from jaxmap.runs.labelling import Notify, as_usage_error
 from jaxmap.runs.perceiving import Keeper, make_keeper
 from jaxmap.runs.perception import Perception, plan_perception, saw_relief
 from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.jax_matcher import JaxMatcher
 from jaxmap.types import MAX_TENSOR_ELEMENTS, Frame, GridSpec, StereoCamera, make_grid
 
 DEFAULT_VOXEL_M: Triple = (0.05, 0.05, 0.2)
@@ -143,7 +144,8 @@ class Plan(Perception):
         """The form of the frames that the step takes."""
         kept = self.observations or self.keeper
         shape = () if kept is None else kept.attributes.kept_shape
-        return frame_form(self.front_end.camera, self.labeller, self.members, shape)
+        matched = self.mapper.design.match is None
+        return frame_form(self.front_end.camera, self.labeller, self.members, shape, matched=matched)
 
     def prepare(self, indices: Sequence[int] | None = None, keep_in: Path | None = None) -> Iterator[PreparedFrame]:
         """Frames, made ready ahead of their use.
@@ -163,6 +165,7 @@ class Plan(Perception):
             self.front_end,
             self.label_folder,
             needs=self.labeller.needs,
+            matched=self.mapper.design.match is None,
             pose_errors=self.pose_errors,
             indices=indices,
         )
@@ -190,6 +193,7 @@ def plan_run(
     *,
     keep: bool = False,
     images: bool = False,
+    match_in_step: bool = False,
     in_tiles: bool = False,
     shared: Sharing | tuple[int, int, int] | None = None,
 ) -> Plan:
@@ -202,6 +206,9 @@ def plan_run(
         on_frame: is told of the progress of odometry, where it gives the poses.
         keep: keep what is perceived, as observations.
         images: of observations, too, let the labeller see the images (`plan_perception`).
+        match_in_step: the step itself matches, where the settings name a matcher in JAX and nothing else wants the
+            disparity of every frame: it is neither kept nor compared with a truth. Otherwise frames are matched
+            ahead, by the same function, compiled apart.
         in_tiles: a map that takes more memory than it may is kept in tiles, not refused.
         shared: fuse regions of the map apart, one at a time on each worker; or the shape of a region.
 
@@ -232,6 +239,9 @@ def plan_run(
         grid, block = _fit_memory(grid, window, len(labeller.classes), members, config.grid.max_memory_gib, tiled=tiled)
     held = ("fused at a time",) if shared else ()
     notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block, *held))
+    match = None
+    if match_in_step and keeper is None and seen.observations is None and sequence.true_disparity is None:
+        match = front_end.matcher if isinstance(front_end.matcher, JaxMatcher) else None
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
     if members:
@@ -244,7 +254,7 @@ def plan_run(
         grid=grid,
         depth_range_m=depth_range_m,
         rule=rule,
-        params=MapperParams(camera, fusion_params, labeller.params, ensemble),
+        params=MapperParams(camera, fusion_params, labeller.params, ensemble, match and match.params),
         fusion=fusion_attribute(config.fusion, rule) | ({"ensemble": asdict(config.ensemble)} if members else {}),
         mapper=make_mapper(
             camera,
@@ -253,6 +263,7 @@ def plan_run(
             rule,
             depth_range_m,
             members=members,
+            match=match and match.design,
             T_world_camera=T_known,
         ),
         key=key,

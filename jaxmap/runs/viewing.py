@@ -138,7 +138,7 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
                 # Observations have that of key frames alone.
                 if left.size:
                     log.left(left, pinhole(camera), camera.width_px)
-                log.picture("disparity", colourise_disparity(prepared.rectified.disparity_px))
+                log.picture("disparity", colourise_disparity(plan.front_end.disparity_of(prepared.rectified)))
                 if classes and prepared.index in plan.key_frames:
                     number = int(voxel_map.frames_fused) - 1
                     labels = plan.mapper.label_image(prepared.frame, plan.params, plan.key, number)

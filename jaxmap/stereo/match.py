@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -15,6 +16,8 @@ _SUBPIXELS = 16
 _FAR_PX = np.float32(1e6)
 _MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
 """OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
+_OF_OPENCV = ("mode", "p1", "p2", "pad_left")
+_OF_STEP = ("cost", "paths", "step_penalty", "jump_penalty", "soft", "temperature")
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 """Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
@@ -54,7 +57,7 @@ class StereoOptions:
     num_disparities: Annotated[int, count(_MOST_DISPARITIES)] | None = None
     """Disparities searched, a multiple of 16; by default an eighth of the image width."""
     block_size: Annotated[int, count(21)] = 7
-    """Edge of the matched block, odd."""
+    """Matchers opencv and sgm: edge of the matched block, odd."""
     p1: Annotated[int, count(_MOST_PENALTY)] | None = None
     """Penalty for a disparity step of one; by default 16 block_size^2, twice what OpenCV suggests: sand has little
     texture."""
@@ -98,6 +101,18 @@ class StereoOptions:
         p1, p2 = self.penalties()
         if not p1 < p2:
             raise _bad(f"p1 is {p1} and p2 is {p2}", "take 0 < p1 < p2")
+        self._refuse_what_means_nothing()
+
+    def _refuse_what_means_nothing(self) -> None:
+        """Refuses options that differ from their defaults and belong to another matcher."""
+        others = _OF_OPENCV if self.matcher != "opencv" else _OF_STEP
+        others = (*others, "cost", "block_size") if self.matcher == "mccnn" else others
+        for one in fields(self):
+            if one.name in others and getattr(self, one.name) != one.default:
+                raise _bad(
+                    f"{one.name} is {getattr(self, one.name)}, which means nothing to the matcher {self.matcher}",
+                    f"leave it at {one.default}, or choose another --stereo.matcher",
+                )
 
     def penalties(self) -> tuple[int, int]:
         """The penalties p1 and p2 of disparity steps."""

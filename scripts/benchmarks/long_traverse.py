@@ -175,7 +175,7 @@ def map_with_octomap(given: argparse.Namespace, plan: Plan, frames: list[Frame],
     (near_m, far_m), camera = plan.depth_range_m, plan.front_end.camera
     clouds = []
     for frame in frames:
-        points, valid = (np.asarray(value) for value in disparity_to_points(camera, frame.disparity_px))
+        points, valid = (np.asarray(value) for value in disparity_to_points(camera, frame.matched_px))
         depth_m = points[..., 2]
         clouds.append(points[valid & (depth_m >= near_m) & (depth_m <= far_m)].astype(np.float64))
     tree, before_mib, started_s = octomap.OcTree(min(given.voxel_size_m)), resident_mib(), time.perf_counter()
