@@ -28,7 +28,7 @@ matched = jax.jit(match, static_argnums=0)
 
 
 def matcher(name: str, width_px: int, count: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """OpenCV's by its mode, or ours by its cost; `census4` has four paths."""
+    """OpenCV's by its mode, or ours by its cost; `census4` has four paths, `census1` compares pixels, not blocks."""
     options = StereoOptions(num_disparities=count, edge_step_px=0)
     if name in ("3way", "sgbm", "hh", "hh4"):
         return Matcher(StereoOptions(num_disparities=count, edge_step_px=0, mode=name), width_px)
@@ -36,7 +36,7 @@ def matcher(name: str, width_px: int, count: int) -> Callable[[np.ndarray, np.nd
         cost="bt" if name == "bt" else "census",
         num_disparities=count,
         paths=4 if name == "census4" else 8,
-        block_size=options.block_size if name == "bt" else 1,
+        block_size=1 if name == "census1" else options.block_size,
         edge_step_px=0,
     )
     params = make_match_params(design.cost)
@@ -47,7 +47,7 @@ def main() -> None:
     """Prints one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=["512x384x64", "1024x768x128"])
-    parser.add_argument("--matchers", nargs="+", default=["3way", "sgbm", "hh", "census", "census4", "bt"])
+    parser.add_argument("--matchers", nargs="+", default=["3way", "sgbm", "hh", "census", "census4", "census1", "bt"])
     parser.add_argument("--rounds", type=int, default=7)
     given = parser.parse_args()
     keep_compiled_programs()
