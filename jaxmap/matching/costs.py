@@ -49,30 +49,19 @@ def cost_volume(design: MatchDesign, left: Image, right: Image, params: MatchPar
     return jnp.moveaxis(cost_planes(design, left, right), 0, -1)
 
 
-def cost_planes(design: MatchDesign, left: Image, right: Image, *, turned: bool = False) -> Num[Array, "D H W"]:
-    """The same, one plane for each disparity.
-
-    Args:
-        design: names the kind of cost.
-        left: rectified grey image, 0 to 255.
-        right: likewise.
-        turned: gives each plane as (W, H). To compute it twice is faster than to turn it.
-    """
+def cost_planes(design: MatchDesign, left: Image, right: Image) -> Num[Array, "D H W"]:
+    """The same, one plane for each disparity."""
     kind = kind_of(design)
-    width, axis = left.shape[1], 0 if turned else 1
+    width = left.shape[1]
     first, last = design.min_disparity_px, design.min_disparity_px + design.num_disparities - 1
     before, after = max(last, 0), max(-first, 0)
-    margin = [(0, 0), (0, 0)]
-    margin[axis] = (before, after)
-    left_features, right_features = (
-        tuple(one.T if turned else one for one in kind.describe(image)) for image in (left, right)
-    )
-    right_features = tuple(jnp.pad(one, margin, "edge") for one in right_features)
-    column = jnp.arange(width) if not turned else jnp.arange(width)[:, None]
+    left_features = kind.describe(left)
+    right_features = tuple(jnp.pad(one, ((0, 0), (before, after)), "edge") for one in kind.describe(right))
+    column = jnp.arange(width)
 
     def raw(place: Array) -> Image:
         start = before - first - place
-        moved = tuple(jax.lax.dynamic_slice_in_dim(one, start, width, axis) for one in right_features)
+        moved = tuple(jax.lax.dynamic_slice_in_dim(one, start, width, 1) for one in right_features)
         return _in_steps(design, kind, kind.compare(left_features, moved))
 
     def cost(place: Array, plane: Image) -> Image:
@@ -82,7 +71,7 @@ def cost_planes(design: MatchDesign, left: Image, right: Image, *, turned: bool 
 
     if design.block_size == 1:
         return jax.lax.map(lambda place: cost(place, raw(place)), jnp.arange(design.num_disparities))
-    return _averaged(design, raw, cost, left_features[0].shape)
+    return _averaged(design, raw, cost, left.shape)
 
 
 def _in_steps(design: MatchDesign, kind: Kind, cost: Array) -> Array:
