@@ -92,7 +92,8 @@ def match_design(options: StereoOptions, width_px: int) -> MatchDesign:
         num_disparities=options.num_disparities or -(-width_px // (8 * 16)) * 16,
         paths=options.paths,
         soft=options.soft,
-        block_size=options.block_size if options.cost == "bt" else 1,
+        # The network itself sees a block.
+        block_size=1 if options.matcher == "mccnn" else options.block_size,
         pre_filter_cap=options.pre_filter_cap,
         left_right_max_diff_px=options.left_right_max_diff_px,
         speckle_window_px=options.speckle_window,

@@ -43,7 +43,7 @@ class StereoOptions:
     step_penalty: Annotated[float, Interval(ge=0, le=1)] | None = None
     """matchers sgm, mccnn: cost of a disparity step of one, where the worst match costs 1; by default, what suits the
     cost."""
-    jump_penalty: Annotated[float, Interval(ge=0, le=2)] | None = None
+    jump_penalty: Annotated[float, Interval(ge=0, le=1)] | None = None
     """matchers sgm, mccnn: cost of a greater step."""
     soft: bool = False
     """matchers sgm, mccnn: soft minima, slower, through which gradients reach images and penalties."""
@@ -56,7 +56,7 @@ class StereoOptions:
     num_disparities: Annotated[int, count(_MOST_DISPARITIES)] | None = None
     """Disparities searched, a multiple of 16; by default an eighth of the image width."""
     block_size: Annotated[int, count(21)] = 7
-    """Edge of the matched block, odd."""
+    """Matchers opencv and sgm: edge of the matched block, odd."""
     p1: Annotated[int, count(_MOST_PENALTY)] | None = None
     """Penalty for a disparity step of one; by default 16 block_size^2, twice what OpenCV suggests: sand has little
     texture."""
@@ -105,7 +105,7 @@ class StereoOptions:
     def _refuse_what_means_nothing(self) -> None:
         """Refuses options that differ from their defaults and belong to another matcher."""
         others = _OF_OPENCV if self.matcher != "opencv" else _OF_STEP
-        others = (*others, "cost") if self.matcher == "mccnn" else others
+        others = (*others, "cost", "block_size") if self.matcher == "mccnn" else others
         for one in fields(self):
             if one.name in others and getattr(self, one.name) != one.default:
                 raise _bad(
