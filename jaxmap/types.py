@@ -230,6 +230,15 @@ def make_grid(
     )
 
 
+LAYER = 16
+"""Voxels of the lattice, in height, whose points share the statistics of a column: those of a tile."""
+
+
+def layer_count(height: int) -> int:
+    """How many layers so many voxels of height touch at most, wherever on the lattice they begin."""
+    return (height + LAYER - 2) // LAYER + 1
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class VoxelMap:
@@ -238,7 +247,7 @@ class VoxelMap:
     Channel 0 is occupancy, channel `1 + c` is class `c`. A voxel that nothing has touched holds
     exact zeros; priors are added when the map is read (`fusion.query`), so that maps can be summed.
     `members` are those of an ensemble (`ensemble.members`), two channels each, where there is one; `surface` are the
-    heights of each column (`fusion.surface`), where they are kept.
+    heights of each column, in layers of `LAYER` voxels of the lattice (`fusion.surface`), where they are kept.
     """
 
     log_odds: Float[Array, "K X Y Z"]
@@ -246,7 +255,7 @@ class VoxelMap:
     grid: GridSpec
     classes: tuple[str, ...] = field(metadata=_static())
     members: Float[Array, "M 2 X Y Z"] | None = None
-    surface: Float[Array, "4 X Y"] | None = None
+    surface: Float[Array, "4 X Y L"] | None = None
 
 
 def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0, *, surface: bool = False) -> VoxelMap:
@@ -268,7 +277,7 @@ def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0, *, 
         grid=grid,
         classes=tuple(classes),
         members=jnp.zeros((members, 2, *grid.shape), jnp.float32) if members else None,
-        surface=jnp.zeros((4, *grid.shape[:2]), jnp.float32) if surface else None,
+        surface=jnp.zeros((4, *grid.shape[:2], layer_count(grid.shape[2])), jnp.float32) if surface else None,
     )
 
 

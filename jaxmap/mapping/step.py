@@ -117,7 +117,7 @@ class FrameEvidence(NamedTuple):
     camera: StereoCamera
     labels: PointLabels
     report: StepReport
-    heights: Float[Array, "4 X Y"] | None = None
+    heights: Float[Array, "4 X Y L"] | None = None
 
 
 @in_full_float32
@@ -161,7 +161,7 @@ def see_frame(
     heights = None
     if rule.surface:
         sigma_m = height_sigma(cloud, pose.translation()[2])
-        heights = gather_heights(window, cloud.points_world, sigma_m, labels.keep)
+        heights = gather_heights(grid, window, cloud.points_world, sigma_m, labels.keep)
 
     hits, freed = _count_voxels(total_weight(counts) > 0, free)
     report = StepReport(

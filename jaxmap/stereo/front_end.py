@@ -15,7 +15,7 @@ from jaxmap.labels import IGNORE
 from jaxmap.stereo.align import alignment_homography, estimate_alignment, match_features
 from jaxmap.stereo.blank import blank_reason
 from jaxmap.stereo.jax_matcher import JaxMatcher, make_matcher
-from jaxmap.stereo.match import Matcher, StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions, as_grey
 from jaxmap.stereo.near import NearGuard
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
 from jaxmap.types import StereoCamera
@@ -51,6 +51,8 @@ class StereoFrontEnd:
         rectified_here: whether the images are raw, and rectified by it.
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
         alignment_rad: rotation vector by which the rectified right camera is corrected, or None.
+        matcher: of the rectified images.
+        near_guard: finds what is too near for the matcher, or None where that was not asked for.
     """
 
     def __init__(
@@ -79,7 +81,7 @@ class StereoFrontEnd:
         self.rectified_here = self.rectifier is not None
         self.camera: StereoCamera = camera
         self.matcher: Matcher | JaxMatcher = make_matcher(options, camera.width_px)
-        self._near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
+        self.near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> RectifiedFrame:
         """Rectifies and matches one pair.
@@ -111,7 +113,7 @@ class StereoFrontEnd:
             left, right = self.rectify(left, right)
         blind = None if self.rectifier is None else ~self.rectifier.seen
         with timed_stage("match", stages_s):
-            near = None if self._near_guard is None else self._near_guard(left, right)
+            near = None if self.near_guard is None else self.near_guard(as_grey(left), as_grey(right))
         times_s = stages_s["rectify"], stages_s["match"]
         if near is None:
             return RectifiedFrame(left, right, None, *times_s, blind=blind)
