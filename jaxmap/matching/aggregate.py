@@ -35,13 +35,12 @@ def aggregate(volume: Num[Array, "H W D"], p1: Any, p2: Any, paths: int = 8) -> 
         uint16 or float32.
     """
     planes = jnp.moveaxis(volume, -1, 0)
-    total = aggregate_planes(planes, planes.swapaxes(1, 2), p1, p2, paths, lambda row: row)
+    total = aggregate_planes(planes, p1, p2, paths, lambda row: row)
     return total.swapaxes(1, 2)
 
 
 def aggregate_planes(
     planes: Num[Array, "D H W"],
-    turned: Num[Array, "D W H"],
     p1: Any,
     p2: Any,
     paths: int,
@@ -53,7 +52,6 @@ def aggregate_planes(
 
     Args:
         planes: costs.
-        turned: the same, each plane as (W, H).
         p1: as in `aggregate`.
         p2: likewise.
         paths: likewise.
@@ -63,6 +61,7 @@ def aggregate_planes(
     wide = jnp.uint16 if planes.dtype == jnp.uint8 else planes.dtype
     moves = (0, 1, -1) if paths == 8 else (0,)
 
+    turned = planes.swapaxes(1, 2)
     from_left = _sweep(turned, None, p1, p2, (0,), planes.dtype)
     from_sides = _sweep(turned, from_left, p1, p2, (0,), planes.dtype, backwards=True).swapaxes(1, 2)
     so_far = _sweep(planes, from_sides, p1, p2, moves, wide)

@@ -49,47 +49,70 @@ def cost_volume(design: MatchDesign, left: Image, right: Image, params: MatchPar
     return jnp.moveaxis(cost_planes(design, left, right), 0, -1)
 
 
-def cost_planes(design: MatchDesign, left: Image, right: Image, *, turned: bool = False) -> Num[Array, "D H W"]:
-    """The same, one plane for each disparity.
-
-    Args:
-        design: names the kind of cost.
-        left: rectified grey image, 0 to 255.
-        right: likewise.
-        turned: gives each plane as (W, H). To compute it twice is faster than to turn it.
-    """
+def cost_planes(design: MatchDesign, left: Image, right: Image) -> Num[Array, "D H W"]:
+    """The same, one plane for each disparity."""
     kind = kind_of(design)
-    width, axis = left.shape[1], 0 if turned else 1
+    width = left.shape[1]
     first, last = design.min_disparity_px, design.min_disparity_px + design.num_disparities - 1
     before, after = max(last, 0), max(-first, 0)
-    margin = [(0, 0), (0, 0)]
-    margin[axis] = (before, after)
-    left_features, right_features = (
-        tuple(one.T if turned else one for one in kind.describe(image)) for image in (left, right)
-    )
-    right_features = tuple(jnp.pad(one, margin, "edge") for one in right_features)
-    column = jnp.arange(width) if not turned else jnp.arange(width)[:, None]
+    left_features = kind.describe(left)
+    right_features = tuple(jnp.pad(one, ((0, 0), (before, after)), "edge") for one in kind.describe(right))
+    column = jnp.arange(width)
 
-    def plane(disparity: Array) -> Num[Array, "H W"]:
-        moved = tuple(jax.lax.dynamic_slice_in_dim(one, before - disparity, width, axis) for one in right_features)
-        cost = kind.compare(left_features, moved)
+    def raw(place: Array) -> Image:
+        start = before - first - place
+        moved = tuple(jax.lax.dynamic_slice_in_dim(one, start, width, 1) for one in right_features)
+        return _in_steps(design, kind, kind.compare(left_features, moved))
+
+    def cost(place: Array, plane: Image) -> Image:
+        disparity = first + place
         inside = (column >= disparity) & (column - disparity < width)
-        return jnp.where(inside, *_scaled(design, kind, cost))
+        return jnp.where(inside, plane, _in_steps(design, kind, jnp.asarray(kind.greatest)))
 
-    return jax.lax.map(plane, jnp.arange(first, last + 1))
+    if design.block_size == 1:
+        return jax.lax.map(lambda place: cost(place, raw(place)), jnp.arange(design.num_disparities))
+    return _averaged(design, raw, cost, left.shape)
 
 
-def _scaled(design: MatchDesign, kind: Kind, cost: Image) -> tuple[Image, Array]:
-    """Averaged over blocks and in the units of the design; and the largest cost."""
-    if design.block_size > 1:
-        cost = block_mean(cost.astype(jnp.float32), design.block_size)
+def _in_steps(design: MatchDesign, kind: Kind, cost: Array) -> Array:
+    """In the units of the design."""
     if design.soft:
-        return cost / kind.greatest, jnp.ones((), cost.dtype)
+        return cost / kind.greatest
     if jnp.issubdtype(cost.dtype, jnp.integer):
-        cost = cost * (design.cost_steps // int(kind.greatest))
-    else:
-        cost = jnp.round(cost * (design.cost_steps / kind.greatest))
-    return cost.astype(jnp.uint8), jnp.uint8(design.cost_steps)
+        return (cost * (design.cost_steps // int(kind.greatest))).astype(jnp.uint8)
+    return jnp.round(cost * (design.cost_steps / kind.greatest)).astype(jnp.uint8)
+
+
+def _averaged(
+    design: MatchDesign, raw: Callable[[Array], Image], cost: Callable[[Array, Image], Image], shape: tuple[int, ...]
+) -> Num[Array, "D H W"]:
+    """Planes of the mean over a block around each pixel; edges are repeated.
+
+    While one plane is compared, the one before it is summed along one axis and the one before that along the other:
+    each waits in memory for its turn, else XLA would compare pixels anew for each of the block.
+    """
+    size, count = design.block_size, design.num_disparities
+    narrow, wide = (jnp.float32, jnp.float32) if design.soft else (jnp.uint8, jnp.uint16)
+
+    def step(i: Array, state: tuple[Image, Image, Array]) -> tuple[Image, Image, Array]:
+        compared, summed, planes = state
+        place = jnp.maximum(i - 2, 0)
+        total = _box_sum(summed, size, 1)
+        mean = total / size**2 if design.soft else ((total + size**2 // 2) // size**2).astype(narrow)
+        planes = jax.lax.dynamic_update_index_in_dim(planes, cost(place, mean), place, 0)
+        return raw(jnp.minimum(i, count - 1)), _box_sum(compared.astype(wide), size, 0), planes
+
+    start = jnp.zeros(shape, narrow), jnp.zeros(shape, wide), jnp.zeros((count, *shape), narrow)
+    return jax.lax.fori_loop(0, count + 2, step, start)[2]
+
+
+def _box_sum(plane: Image, size: int, axis: int) -> Image:
+    """Sums of so many neighbours along an axis."""
+    margin = [(0, 0), (0, 0)]
+    margin[axis] = (size // 2, size // 2)
+    padded, length = jnp.pad(plane, margin, "edge"), plane.shape[axis]
+    parts = [jax.lax.slice_in_dim(padded, i, i + length, axis=axis) for i in range(size)]
+    return sum(parts[1:], parts[0])
 
 
 def kind_of(design: MatchDesign) -> Kind:
@@ -160,17 +183,3 @@ def birchfield_tomasi(left: Features, right: Features) -> Float[Array, "H W"]:
         to_left = jnp.maximum(jnp.maximum(there - high, low - there), 0)
         total += jnp.minimum(to_right, to_left)
     return total
-
-
-def block_mean(cost: Float[Array, "H W"], size: int) -> Float[Array, "H W"]:
-    """Mean over a square around each pixel; edges are repeated."""
-    half = size // 2
-    for axis in (0, 1):
-        margin = [(0, 0), (0, 0)]
-        margin[axis] = (half, half)
-        padded, length = jnp.pad(cost, margin, "edge"), cost.shape[axis]
-        cost = sum(
-            (jax.lax.slice_in_dim(padded, i, i + length, axis=axis) for i in range(1, size)),
-            jax.lax.slice_in_dim(padded, 0, length, axis=axis),
-        )
-    return cost / size**2

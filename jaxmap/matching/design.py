@@ -13,9 +13,9 @@ from jaxmap.types import to_device
 
 Cost = Literal["census", "bt", "mccnn"]
 
-_MOST_STEPS = 63
-MOST_P1, MOST_P2 = 1.0, 2.0
-"""Where a cost is 63 steps at most, what two paths add up to fits into 8 bits."""
+_MOST_STEPS = 127
+MOST_P1, MOST_P2 = 1.0, 1.0
+"""Where a cost is 127 steps at most, the ends of paths, and what two paths add to a cost, fit into 8 bits."""
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,9 @@ def match(
         params: the numbers.
     """
     left, right = grey(left), grey(right)
-    costs, turned = (cost_planes(design, left, right, turned=turned) for turned in (False, True))
+    costs = cost_planes(design, left, right)
     p1, p2 = penalties(design, params)
-    disparity_px = decide(design, aggregate_planes(costs, turned, p1, p2, design.paths, winners), params)
+    disparity_px = decide(design, aggregate_planes(costs, p1, p2, design.paths, winners), params)
     return disparity_px if design.soft else jnp.round(disparity_px * _SUBPIXELS) / _SUBPIXELS
 
 

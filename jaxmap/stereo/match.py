@@ -43,7 +43,7 @@ class StereoOptions:
     step_penalty: Annotated[float, Interval(ge=0, le=1)] | None = None
     """matchers sgm, mccnn: cost of a disparity step of one, where the worst match costs 1; by default, what suits the
     cost."""
-    jump_penalty: Annotated[float, Interval(ge=0, le=2)] | None = None
+    jump_penalty: Annotated[float, Interval(ge=0, le=1)] | None = None
     """matchers sgm, mccnn: cost of a greater step."""
     soft: bool = False
     """matchers sgm, mccnn: soft minima, slower, through which gradients reach images and penalties."""

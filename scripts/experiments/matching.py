@@ -39,12 +39,12 @@ def opencv(mode: str, width_px: int) -> Match:
 
 
 def ours(kind: str, width_px: int, p1: float | None, p2: float | None) -> Match:
-    """Ours, by the kind of cost: census9x7 (`census`), census5x5, census with blocks of 3 (`census+3`) or `bt`."""
+    """Ours, by the kind of cost: `census` of 7 x 9, `census5x5`, `census1` of single pixels, or `bt`."""
     options = StereoOptions()
     design = MatchDesign(
         cost="bt" if kind == "bt" else "census",
         census_window_px=(5, 5) if kind == "census5x5" else (7, 9),
-        block_size=options.block_size if kind == "bt" else 3 if kind == "census+3" else 1,
+        block_size=1 if kind == "census1" else options.block_size,
         num_disparities=Matcher(options, width_px).num_disparities,
         edge_step_px=0,
     )

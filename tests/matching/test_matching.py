@@ -70,6 +70,19 @@ def test_birchfield_tomasi_costs_are_those_of_the_twin(first, soft):
     np.testing.assert_allclose(cost, expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("cost", ["census", "bt"])
+def test_blocks_have_the_mean_of_their_costs(cost):
+    design, params = replace(PLAIN, cost=cost), make_match_params(cost)
+    size, half = 3, 1
+    blocks = costs_of(replace(design, block_size=size), noise(0), noise(1), params)
+    plain = np.asarray(costs_of(design, noise(0), noise(1), params), float)
+    means = np.zeros(plain.shape)
+    for v, u in np.ndindex(HEIGHT - 2 * half, WIDTH - 2 * half):
+        means[v + half, u + half] = plain[v : v + size, u : u + size].mean((0, 1))
+    within = (slice(half, -half), slice(COUNT, -half))
+    np.testing.assert_array_equal(np.asarray(blocks)[within], np.floor(means + 0.5)[within])
+
+
 @pytest.mark.parametrize("paths", [4, 8])
 @pytest.mark.parametrize(("p1", "p2"), [(3, 20), (0, 0), (63, 127), (9, 4)])
 def test_sums_of_small_integers_are_exact(paths, p1, p2):
