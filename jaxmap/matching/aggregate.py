@@ -28,7 +28,7 @@ def aggregate(volume: Num[Array, "H W D"], p1: Any, p2: Any, paths: int = 8) -> 
     Args:
         volume: matching costs, uint8 (exact) or float32.
         p1: penalty of a disparity step of one, in the units and of the type of the volume.
-        p2: penalty of a greater step; where the volume is uint8, at most 127, with it at most 255, and so with `p1`.
+        p2: penalty of a greater step; where the volume is uint8, its sums with itself, `p1` and any cost are at most 255.
         paths: 4 (rows and columns) or 8 (and diagonals).
 
     Returns:

@@ -90,14 +90,15 @@ def main() -> None:
     parser.add_argument("--matchers", nargs="+", default=["3way", "sgbm", "hh", "census", "bt"])
     parser.add_argument("--p1", nargs="+", type=float, default=[None])
     parser.add_argument("--p2", nargs="+", type=float, default=[None])
-    parser.add_argument("--frames", type=int, default=3, help="of each traverse and drive, spread over it")
-    parser.add_argument("--traverses", type=Path, nargs="*", help="others than simdata's two and the sample")
+    parser.add_argument("--frames", type=int, default=3, help="of each traverse, of those with a true depth")
+    parser.add_argument("--traverses", nargs="+", help="others than simdata's two and the sample")
+    parser.add_argument("--stop", type=int, default=10, help="of traverses, so many frames alone are read")
     parser.add_argument("--json", type=Path, help="file for the table")
     given = parse(parser)
     cv2.setNumThreads(1)
     columns = {"data": "<16", "matcher": "<9", "p1": "5.2f", "p2": "5.2f"}
     table = Table({**columns, **{name: f"{max(len(name) + 1, 8)}.4f" for name in SCORES}, "ms": "6.0f"})
-    for site in sites(given.data, given.traverses, ()):
+    for site in sites(given.data, given.traverses, (), given.stop):
         if isinstance(site, Simulated):
             site.chosen = site.chosen[:: max(len(site.chosen) // given.frames, 1)][: given.frames]
         for kind in given.matchers:
