@@ -24,6 +24,7 @@ DISTRIBUTIONS = {
     "annotated_types": "annotated-types",
     "cv2": "opencv-python-headless",
     "google": "protobuf",
+    "mc_cnn": "mccnn",
     "mcap_protobuf": "mcap-protobuf-support",
     "octomap": "octomap-python",
     "PIL": "pillow",

@@ -25,7 +25,8 @@ class TuneArguments:
     Maps the frames once, then moves increments, priors, thresholds, range weighting and the labeller's own numbers
     to where the map agrees best with the ground truth. Part of the ground is held out and decides when to stop.
     Writes OUT, a configuration for jaxmap map --config, at every step that is the best so far; and beside it
-    OUT's .json (scores before and after, with intervals) and .html (the same with plots).
+    OUT's .json (scores before and after, with intervals) and .html (the same with plots). With --through stereo the
+    penalties, uniqueness and cost network of stereo matching are tuned instead, by the map that they lead to.
     """
 
     sequence: tyro.conf.Positional[tuple[str, ...]]
@@ -86,7 +87,13 @@ def main(words: Sequence[str]) -> int:
     coding = choose_coding(arguments.remap, arguments.palette)
     truth = TruthOptions(arguments.target, coding, arguments.truth_crs)
     with locked(out.parent), replacement.place(out.name, console.notify) as place:
-        run = TuningRun([Source(*row) for row in rows], config, truth, options, place / out.name, notify=console.notify)
+        given = [Source(*row) for row in rows], config, truth, options, place / out.name
+        if options.through == "stereo":
+            from jaxmap.runs.stereo_tuning import StereoTuningRun
+
+            run: TuningRun | StereoTuningRun = StereoTuningRun(*given, final=out, notify=console.notify)
+        else:
+            run = TuningRun(*given, notify=console.notify)
         with console.steps("reading", "frames", run.frames) as advance:
             run.cache(advance)
         with console.steps("tuning", "steps", options.descent.steps * (1 + bool(options.kernel))) as advance:
@@ -94,12 +101,12 @@ def main(words: Sequence[str]) -> int:
     _print(console, result)
     for note in result["notes"]:
         console.notify(f"note: {note}")
-    console.result(out.parent, [path.name for path in _outputs(out)])
+    console.result(out.parent, [path.name for path in _outputs(out) if path.exists()])
     return 0
 
 
 def _outputs(out: Path) -> list[Path]:
-    return [out, out.with_suffix(".json"), out.with_suffix(".html")]
+    return [out, *(out.with_suffix(suffix) for suffix in (".json", ".html", ".safetensors"))]
 
 
 def _check(arguments: TuneArguments, config: MapConfig) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import operator
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,14 +12,23 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
-from jaxtyping import Array, Int, UInt8, UInt16
+from jaxtyping import Array, Int, UInt8
+
+from jaxmap.errors import UsageError
+from jaxmap.matching.select import Winners
 
 STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 """Rows and columns from one pixel of a path to the next: along rows and columns, then along diagonals."""
 _LANES, _IN_WORD = 32, 4
 """Threads of a warp, and costs in a 32-bit word."""
-_FAR = 1 << 14
-"""Greater than all costs: that of disparities that are not searched."""
+_FAR, _MOST = 1 << 14, (1 << 16) - 1
+"""Greater than all costs of a path, and the greatest sum of 16 bits: those of disparities that are not searched."""
+_FIELDS, _PART = 4, 128
+"""Numbers that are kept of a pixel, and pixels of a row that one warp works off."""
+_MOST_WORDS = 1 << 31
+"""Of the costs of all paths: places are 32-bit integers."""
+_TOO_OLD = re.compile(r"[1-7]\.\d")
+"""Compute capabilities that Triton does not support."""
 
 Costs = list[Int[Array, "lanes"]]
 """The costs of a pixel; thread `i` holds the disparities `i n` to `(i + 1) n - 1` as its items in the n
@@ -27,38 +38,73 @@ _Shift = Callable[[Array, int], Array]
 """Moves the items of an array to the next threads of the warp (1), or to those before (-1)."""
 
 
-def aggregate_gpu(
-    volume: UInt8[Array, "H W D"], p1: Any, p2: Any, paths: int = 8, *, interpret: bool = False
-) -> UInt16[Array, "H W D"]:
-    """`aggregate.aggregate` of a volume of small integers, bit for bit, as one kernel for all paths and one for their sum.
+def check_cards(devices: Sequence[Any]) -> None:
+    """Says it where the kernels cannot be compiled for one of JAX's devices, before Triton does so at length.
 
-    Of each path the costs are written apart, 8 bits each, since to add them up in memory would move more.
+    Raises:
+        UsageError: a card is too old for them.
+    """
+    for one in devices:
+        # AMD's devices have other names for it, CPUs have none.
+        if _TOO_OLD.fullmatch(capability := str(getattr(one, "compute_capability", ""))):
+            raise UsageError(
+                f"{one.device_kind} has compute capability {capability}, and the kernels of stereo matching need 8.0",
+                fix="give --stereo.no-kernels: the same disparities, more slowly",
+            )
+
+
+def winners_gpu(volume: UInt8[Array, "H W D"], p1: Any, p2: Any, paths: int = 8, *, interpret: bool = False) -> Winners:
+    """The winners of the volume, its costs aggregated along paths: those of `aggregate` and `select`, bit for bit.
+
+    Two kernels: of each path the costs are written apart, 8 bits each, since to add them up in memory would move more;
+    then they are read once for the sum and all that is kept of it, which is never written.
 
     Args:
         volume: matching costs; with `p2` at most 255.
         p1: penalty of a disparity step of one.
         p2: penalty of a greater step; with `p1` at most 255.
         paths: 4 (rows and columns) or 8 (and diagonals).
-        interpret: runs the kernel as JAX operations, on any device.
+        interpret: runs the kernels as JAX operations, on any device.
+
+    Raises:
+        UsageError: the costs of all paths are more than 32 bits can count.
     """
     height, width, count = volume.shape
+    shape = {"size": (height, width), "count": count}
+    run = functools.partial(
+        pl.pallas_call, compiler_params=plgpu.CompilerParams(num_warps=1, num_stages=1), interpret=interpret
+    )
     padded = jnp.pad(volume, ((0, 0), (0, 0), (0, -count % (_LANES * _IN_WORD))))
     words = jax.lax.bitcast_convert_type(padded.reshape(height, width, -1, _IN_WORD), jnp.int32)
-    ends = pl.pallas_call(
-        functools.partial(_walk, size=(height, width), count=count, shift=_rolled if interpret else _shuffled),
+    if paths * words.size >= _MOST_WORDS:
+        raise UsageError(
+            f"{width}x{height} px, {count} disparities and {paths} paths are more than the kernels of stereo can count",
+            fix="search fewer disparities (--stereo.num-disparities) or give --stereo.no-kernels",
+        )
+    ends = run(
+        functools.partial(_walk, **shape, shift=_rolled if interpret else _shuffled),
         out_shape=jax.ShapeDtypeStruct((paths * words.size,), jnp.int32),
         grid=(max(height, width), paths),
-        compiler_params=plgpu.CompilerParams(num_warps=1, num_stages=1),
-        interpret=interpret,
         name="walk_paths",
     )(
         words.reshape(-1),
         jnp.asarray(STEPS[:paths], jnp.int32),
         jnp.stack([jnp.asarray(penalty, jnp.int32) for penalty in (p1, p2)]),
     )
-    total = _sum_of_bytes(ends.reshape(paths, *words.shape))
-    # Else each of its consumers would compute the sum anew.
-    return jax.lax.optimization_barrier(total[..., :count])
+    found = run(
+        functools.partial(_choose, **shape, paths=paths),
+        out_shape=jax.ShapeDtypeStruct((height * width * _FIELDS,), jnp.int32),
+        grid=(-(-width // _PART), height),
+        name="choose_winners",
+    )(ends)
+    best, second, lower, higher = jnp.moveaxis(found.reshape(height, width, _FIELDS), -1, 0)
+    return Winners(
+        place=(best & ((1 << _bits(count)) - 1)).astype(jnp.int16),
+        cost=(best >> _bits(count)).astype(jnp.uint16),
+        second=second.astype(jnp.uint16),
+        lower=lower.astype(jnp.uint16),
+        higher=higher.astype(jnp.uint16),
+    )
 
 
 def _walk(
@@ -97,7 +143,8 @@ def _walk(
         place = path * (height * width * _LANES * per_lane) + words(row, column)
         for word in range(per_lane):
             four = enumerate(here[_IN_WORD * word : _IN_WORD * (word + 1)])
-            plgpu.store(ends.at[place + word], sum((one & 0xFF) << 8 * byte for byte, one in four))
+            placed = [(one & 0xFF) << 8 * byte for byte, one in four]
+            plgpu.store(ends.at[place + word], functools.reduce(operator.or_, placed))
         return (next_row, next_column), ahead, [jnp.where(leaves, 0, one) for one in here]
 
     start = [jnp.zeros(_LANES, jnp.int32)] * (per_lane * _IN_WORD)
@@ -106,7 +153,7 @@ def _walk(
 
 def _cheapest_step(before: Sequence[Array], p1: Array, p2: Array, lane: Array, shift: _Shift) -> Costs:
     """What it costs to come from the pixel before, above its least cost; `p2` at most."""
-    least = functools.reduce(jnp.minimum, before).min()
+    least = _least(before)
     stay = [jnp.minimum(one - least, p2) for one in before]
     lower = jnp.where(lane == 0, _FAR, shift(stay[-1], 1))
     upper = jnp.where(lane == _LANES - 1, _FAR, shift(stay[0], -1))
@@ -133,10 +180,56 @@ def _rolled(values: Array, by: int) -> Array:
     return jnp.roll(values, by)
 
 
-def _sum_of_bytes(words: Int[Array, "paths H W words"]) -> UInt16[Array, "H W D"]:
-    """The sum over paths; two bytes of a word at a time, so that what is read and written stays whole words."""
-    even = sum(one & 0x00FF00FF for one in words)
-    odd = sum((one >> 8) & 0x00FF00FF for one in words)
-    first, last = (even & 0xFFFF) | (odd << 16), ((even >> 16) & 0xFFFF) | (odd & -0x10000)
-    pairs = jax.lax.bitcast_convert_type(jnp.stack([first, last], -1), jnp.uint16)
-    return pairs.reshape(*words.shape[1:3], -1)
+def _choose(ends: Any, found: Any, *, size: tuple[int, int], count: int, paths: int) -> None:
+    """The program of a part of a row: sums the paths and keeps the winners.
+
+    A cost and its disparity make one number, the least of which is the first winner.
+    """
+    (height, width), (part, row) = map(jnp.int32, size), (pl.program_id(0), pl.program_id(1))
+    lane, per_lane = jax.lax.iota(jnp.int32, _LANES), -(-count // (_LANES * _IN_WORD))
+    disparity = [lane * per_lane * _IN_WORD + item for item in range(per_lane * _IN_WORD)]
+
+    def pixel(index: Any) -> Array:
+        # Where the row ends before its last part does, its last pixel comes several times.
+        return row * width + jnp.minimum(part * _PART + index, width - 1)
+
+    def read(pixel: Array) -> list[list[Array]]:
+        place, apart = (pixel * _LANES + lane) * per_lane, height * width * _LANES * per_lane
+        return [[plgpu.load(ends.at[path * apart + place + word]) for path in range(paths)] for word in range(per_lane)]
+
+    def step(index: Any, packed: list[list[Array]]) -> list[list[Array]]:
+        ahead = read(pixel(index + 1))
+        total = [one for words in packed for one in _sum_of_bytes(words)]
+        if count % (_LANES * _IN_WORD):
+            total = [jnp.where(at < count, one, _MOST) for at, one in zip(disparity, total, strict=True)]
+        best = _least([(one << _bits(count)) | at for at, one in zip(disparity, total, strict=True)])
+        place, cost = best & ((1 << _bits(count)) - 1), best >> _bits(count)
+        second, lower, higher = (
+            _least([jnp.where(wanted(at - place), one, _MOST) for at, one in zip(disparity, total, strict=True)])
+            for wanted in (lambda by: jnp.abs(by) > 1, lambda by: by == -1, lambda by: by == 1)
+        )
+        lower = jnp.where(place > 0, lower, cost)
+        higher = jnp.where(place < count - 1, higher, cost)
+        # All threads write, those that have the same field the same number.
+        field = lane % _FIELDS
+        numbers = jnp.where(field < 2, jnp.where(field == 0, best, second), jnp.where(field == 2, lower, higher))
+        plgpu.store(found.at[pixel(index) * _FIELDS + field], numbers)
+        return ahead
+
+    jax.lax.fori_loop(0, _PART, step, read(pixel(0)))
+
+
+def _sum_of_bytes(words: Sequence[Array]) -> Costs:
+    """The sums of the bytes of words, two at a time."""
+    even = functools.reduce(operator.add, [word & 0x00FF00FF for word in words])
+    odd = functools.reduce(operator.add, [(word >> 8) & 0x00FF00FF for word in words])
+    return [even & 0xFFFF, odd & 0xFFFF, even >> 16, odd >> 16]
+
+
+def _least(costs: Sequence[Array]) -> Array:
+    return functools.reduce(jnp.minimum, costs).min()
+
+
+def _bits(count: int) -> int:
+    """Bits that hold a disparity."""
+    return max(count - 1, 1).bit_length()

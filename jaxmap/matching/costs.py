@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Num, UInt8, UInt32
 
 from jaxmap.matching.design import MatchDesign, MatchParams
+from jaxmap.matching.mccnn import feature_costs
+from jaxmap.matching.soft_costs import soft_census_costs
 
 Image = Num[Array, "H W"]
 Features = tuple[Image, ...]
@@ -32,7 +34,9 @@ class Kind(NamedTuple):
     greatest: float
 
 
-def cost_volume(design: MatchDesign, left: Image, right: Image, params: MatchParams) -> Num[Array, "H W D"]:
+def cost_volume(
+    design: MatchDesign, left: Image, right: Image, params: MatchParams, *, at_once: bool = False
+) -> Num[Array, "H W D"]:
     """Costs of all pixels at all disparities searched.
 
     Args:
@@ -40,29 +44,28 @@ def cost_volume(design: MatchDesign, left: Image, right: Image, params: MatchPar
         left: rectified grey image, 0 to 255.
         right: likewise.
         params: hold the weights of the cost network, where the design has one.
+        at_once: computes all disparities side by side, as a GPU likes it, and not one after the other.
 
     Returns:
         uint8 in steps of 1 / `design.cost_steps`, or in soft mode float32 in [0, 1]; the largest cost where the match
         lies outside the right image.
     """
-    del params
-    return jnp.moveaxis(cost_planes(design, left, right), 0, -1)
+    if at_once and not (design.soft or design.cost == "mccnn"):
+        return _costs_at_once(design, left, right)
+    return jnp.moveaxis(cost_planes(design, left, right, params), 0, -1)
 
 
-def cost_planes(design: MatchDesign, left: Image, right: Image) -> Num[Array, "D H W"]:
+def cost_planes(design: MatchDesign, left: Image, right: Image, params: MatchParams) -> Num[Array, "D H W"]:
     """The same, one plane for each disparity."""
+    if design.soft or design.cost == "mccnn":
+        return jnp.moveaxis(_float_costs(design, left, right, params), -1, 0)
     kind = kind_of(design)
     width = left.shape[1]
-    first, last = design.min_disparity_px, design.min_disparity_px + design.num_disparities - 1
-    before, after = max(last, 0), max(-first, 0)
-    left_features = kind.describe(left)
-    right_features = tuple(jnp.pad(one, ((0, 0), (before, after)), "edge") for one in kind.describe(right))
-    column = jnp.arange(width)
+    first, column = design.min_disparity_px, jnp.arange(width)
+    compare = _comparison(design, kind, left, right)
 
     def raw(place: Array) -> Image:
-        start = before - first - place
-        moved = tuple(jax.lax.dynamic_slice_in_dim(one, start, width, 1) for one in right_features)
-        return _in_steps(design, kind, kind.compare(left_features, moved))
+        return _in_steps(design, kind, compare(place))
 
     def cost(place: Array, plane: Image) -> Image:
         disparity = first + place
@@ -74,10 +77,24 @@ def cost_planes(design: MatchDesign, left: Image, right: Image) -> Num[Array, "D
     return _averaged(design, raw, cost, left.shape)
 
 
+def _costs_at_once(design: MatchDesign, left: Image, right: Image) -> UInt8[Array, "H W D"]:
+    """Small integers, all planes side by side."""
+    kind, size = kind_of(design), design.block_size
+    compare, places = _comparison(design, kind, left, right), jnp.arange(design.num_disparities)
+    cost = jax.vmap(lambda place: _in_steps(design, kind, compare(place)), out_axes=-1)(places)
+    if size > 1:
+        total = cost.astype(jnp.uint16)
+        for axis in (0, 1):
+            # Kept in memory, else XLA might compare pixels anew for each of the block.
+            total = _box_sum(jax.lax.optimization_barrier(total), size, axis)
+        cost = ((total + size**2 // 2) // size**2).astype(jnp.uint8)
+    column = jnp.arange(left.shape[1])[:, None] - design.min_disparity_px - places
+    inside = (column >= 0) & (column < left.shape[1])
+    return jnp.where(inside, cost, _in_steps(design, kind, jnp.asarray(kind.greatest)))
+
+
 def _in_steps(design: MatchDesign, kind: Kind, cost: Array) -> Array:
     """In the units of the design."""
-    if design.soft:
-        return cost / kind.greatest
     if jnp.issubdtype(cost.dtype, jnp.integer):
         return (cost * (design.cost_steps // int(kind.greatest))).astype(jnp.uint8)
     return jnp.round(cost * (design.cost_steps / kind.greatest)).astype(jnp.uint8)
@@ -92,13 +109,13 @@ def _averaged(
     each waits in memory for its turn, else XLA would compare pixels anew for each of the block.
     """
     size, count = design.block_size, design.num_disparities
-    narrow, wide = (jnp.float32, jnp.float32) if design.soft else (jnp.uint8, jnp.uint16)
+    narrow, wide = jnp.uint8, jnp.uint16
 
     def step(i: Array, state: tuple[Image, Image, Array]) -> tuple[Image, Image, Array]:
         compared, summed, planes = state
         place = jnp.maximum(i - 2, 0)
         total = _box_sum(summed, size, 1)
-        mean = total / size**2 if design.soft else ((total + size**2 // 2) // size**2).astype(narrow)
+        mean = ((total + size**2 // 2) // size**2).astype(narrow)
         planes = jax.lax.dynamic_update_index_in_dim(planes, cost(place, mean), place, 0)
         return raw(jnp.minimum(i, count - 1)), _box_sum(compared.astype(wide), size, 0), planes
 
@@ -108,11 +125,48 @@ def _averaged(
 
 def _box_sum(plane: Image, size: int, axis: int) -> Image:
     """Sums of so many neighbours along an axis."""
-    margin = [(0, 0), (0, 0)]
+    margin = [(0, 0)] * plane.ndim
     margin[axis] = (size // 2, size // 2)
     padded, length = jnp.pad(plane, margin, "edge"), plane.shape[axis]
     parts = [jax.lax.slice_in_dim(padded, i, i + length, axis=axis) for i in range(size)]
     return sum(parts[1:], parts[0])
+
+
+def _box_mean(plane: Image, size: int) -> Image:
+    return _box_sum(_box_sum(plane, size, 0), size, 1) / size**2
+
+
+def _float_costs(design: MatchDesign, left: Image, right: Image, params: MatchParams) -> Num[Array, "H W D"]:
+    """Costs that are no small integers from the first: a network's, and all of the soft mode."""
+    first, count = design.min_disparity_px, design.num_disparities
+    if design.cost == "mccnn":
+        cost = feature_costs(params.cost, left, right, first, count)
+    elif design.cost == "census":
+        cost = soft_census_costs(design, left, right, params.temperature)
+    else:
+        kind = kind_of(design)
+        cost = jax.vmap(_comparison(design, kind, left, right), out_axes=-1)(jnp.arange(count)) / kind.greatest
+    if design.block_size > 1:
+        cost = jax.vmap(_box_mean, (-1, None), -1)(cost, design.block_size)
+    column = jnp.arange(left.shape[1])[:, None] - first - jnp.arange(count)
+    cost = jnp.where((column >= 0) & (column < left.shape[1]), cost, 1)
+    return cost if design.soft else jnp.round(cost * design.cost_steps).astype(jnp.uint8)
+
+
+def _comparison(design: MatchDesign, kind: Kind, left: Image, right: Image) -> Callable[[Array], Image]:
+    """Gives what a match costs, in the units of its kind, from the place of a disparity among those searched."""
+    width = left.shape[1]
+    first, last = design.min_disparity_px, design.min_disparity_px + design.num_disparities - 1
+    before, after = max(last, 0), max(-first, 0)
+    left_features = kind.describe(left)
+    right_features = tuple(jnp.pad(one, ((0, 0), (before, after)), "edge") for one in kind.describe(right))
+
+    def compare(place: Array) -> Image:
+        start = before - first - place
+        moved = tuple(jax.lax.dynamic_slice_in_dim(one, start, width, 1) for one in right_features)
+        return kind.compare(left_features, moved)
+
+    return compare
 
 
 def kind_of(design: MatchDesign) -> Kind:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
 from jaxmap.matching.aggregate import aggregate_planes
-from jaxmap.matching.costs import cost_planes
+from jaxmap.matching.costs import cost_planes, cost_volume
 from jaxmap.matching.design import MOST_P1, MOST_P2, MatchDesign, MatchParams
-from jaxmap.matching.select import decide, winners
+from jaxmap.matching.select import Winners, decide, winners
+from jaxmap.matching.soft import soft_match
 
 _SUBPIXELS = 16
 
@@ -28,16 +30,36 @@ def match(
         params: the numbers.
     """
     left, right = grey(left), grey(right)
-    costs = cost_planes(design, left, right)
+    if design.soft:
+        found = soft_match(design, left, right, params)
+        return jnp.where(found.confidence >= 0.5, found.disparity_px, jnp.nan)
+    disparity_px = decide(design, find_winners(design, left, right, params), params)
+    return jnp.round(disparity_px * _SUBPIXELS) / _SUBPIXELS
+
+
+def find_winners(
+    design: MatchDesign, left: Num[Array, "H W"], right: Num[Array, "H W"], params: MatchParams
+) -> Winners:
+    """The cheapest disparities of two grey images; on a CUDA device by kernels made for it, bit for bit the same."""
     p1, p2 = penalties(design, params)
-    disparity_px = decide(design, aggregate_planes(costs, p1, p2, design.paths, winners), params)
-    return disparity_px if design.soft else jnp.round(disparity_px * _SUBPIXELS) / _SUBPIXELS
+
+    def by_rows(left: Array, right: Array) -> Winners:
+        return aggregate_planes(cost_planes(design, left, right, params), p1, p2, design.paths, winners)
+
+    def by_paths(left: Array, right: Array) -> Winners:
+        from jaxmap.matching.aggregate_gpu import check_cards, winners_gpu
+
+        check_cards(jax.devices())
+        return winners_gpu(cost_volume(design, left, right, params, at_once=True), p1, p2, design.paths)
+
+    # Where there is nothing but a CPU, the other way is not even traced: to import Pallas takes a quarter of a second.
+    if jax.default_backend() == "cpu" or not design.kernels:
+        return by_rows(left, right)
+    return jax.lax.platform_dependent(left, right, cuda=by_paths, default=by_rows)
 
 
 def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
-    """The penalties in the units of the volume of costs; where they are small integers, at most what 8 bits hold."""
-    if design.soft:
-        return params.p1, params.p2
+    """The penalties in the units of the volume of costs, at most what 8 bits hold."""
     steps = (jnp.clip(params.p1, 0, MOST_P1), jnp.clip(params.p2, 0, MOST_P2))
     p1, p2 = (jnp.round(penalty * design.cost_steps).astype(jnp.uint8) for penalty in steps)
     return p1, p2

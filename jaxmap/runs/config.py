@@ -138,6 +138,9 @@ def absolute_tree(config: PerceiveConfig) -> dict[str, Any]:
     for name in ("poses", "calibration", "model", "labels", "rover"):
         if tree.get(name) is not None and Path(tree[name]).exists():
             tree[name] = str(Path(tree[name]).absolute())
+    network = tree["stereo"].get("cost_network")
+    if network is not None and Path(network).exists():
+        tree["stereo"] = tree["stereo"] | {"cost_network": str(Path(network).absolute())}
     return tree
 
 

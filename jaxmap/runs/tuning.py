@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from jaxmap.errors import UsageError
 from jaxmap.fusion.params import fusion_numbers
 from jaxmap.host.files import atomic_path
 from jaxmap.host.output_folder import write_json, write_yaml
+from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.report.tuning_page import tuning_page
 from jaxmap.runs.checking import finding_line
 from jaxmap.runs.config import MapConfig, config_tree
@@ -35,6 +36,7 @@ from jaxmap.tuning.traverse_loss import (
     score_cells,
     traverse_losses,
 )
+from jaxmap.types import Frame
 
 SOFT_START_M = 0.03
 """Where the width of the plane's threshold starts when the settings have a sharp one, which nothing can move."""
@@ -134,7 +136,7 @@ def plan_tuning(
         mappings.append(plan_run(source.sequence, mine, notify))
         if len(mappings) == 1:
             # What a sequence leaves open is decided once: the numbers hold for these voxels and this range.
-            config = _decided(config, mappings[0])
+            config = decided(config, mappings[0])
     classes = mappings[0].labeller.classes
     if target not in classes:
         raise UsageError(
@@ -152,7 +154,7 @@ def plan_tuning(
     return TuningPlan(config, tuple(mappings), classes.index(target), before, start)
 
 
-def _decided(config: MapConfig, plan: Plan) -> MapConfig:
+def decided(config: MapConfig, plan: Plan) -> MapConfig:
     """The settings with voxels and range as the first sequence has them."""
     size_m = tuple(float(edge) for edge in np.asarray(plan.grid.voxel_size_m, np.float64).round(6))
     return replace(
@@ -169,6 +171,134 @@ def plain(params: TunedParams) -> dict[str, Any]:
     return {
         name: np.asarray(value, np.float64).round(6).tolist() for name, value in values.items() if value is not None
     }
+
+
+def usable_frames(
+    frames: Iterable[PreparedFrame], *, strict: bool, notify: Notify, on_frame: Callable[[PreparedFrame], None]
+) -> Iterator[Frame]:
+    """The frames that are ready; of the others it is told, or they stop it.
+
+    Args:
+        frames: as `Plan.prepare` makes them.
+        strict: stop at the first that cannot be used.
+        notify: takes a line on each that is left out.
+        on_frame: is called with every frame.
+
+    Raises:
+        FrameError: a frame cannot be used, and `strict` is set.
+    """
+    for prepared in frames:
+        if prepared.frame is not None:
+            yield prepared.frame
+        elif prepared.fault is not None and strict:
+            raise prepared.fault
+        else:
+            notify(f"skipped {prepared.ref.name}: {prepared.fault}")
+        on_frame(prepared)
+
+
+def read_traverse(
+    source: Source, plan: Plan, frames: Iterable[Frame], truth: TruthOptions, options: TuneOptions, *, notify: Notify
+) -> Traverse:
+    """What tuning keeps of the frames of a traverse, and its truth.
+
+    Raises:
+        JaxmapError: data that do not serve.
+    """
+    recipe = CacheRecipe(plan.front_end.camera, plan.grid, plan.labeller, plan.rule, plan.depth_range_m)
+    class_map = class_layer_of(
+        plan.mapper.init(),
+        plan.params.fusion,
+        plan.rule,
+        truth.target,
+        site_origin=plan.sequence.site_origin,
+        crs=plan.sequence.crs,
+    )
+    raster = read_truth([source.truth], class_map.place, truth)
+    for note in raster.notes:
+        notify(f"note: {note}")
+    return make_traverse(
+        plan.sequence.name,
+        recipe,
+        build_cache(recipe, frames, plan.params, plan.key, block_px=options.block_px),
+        raster,
+        plan.sequence.site_origin,
+        plan.sequence.crs,
+        cell_size_m=options.cell_size_m,
+        rock_fraction=options.loss.rock_fraction,
+        held_out_share=options.held_out_share,
+        seed=options.seed,
+    )
+
+
+def scores_of_parts(
+    traverses: Sequence[Traverse], old: Sequence[ScoredCells], new: Sequence[ScoredCells], seed: int
+) -> dict[str, Any]:
+    """`scores` and `calibration` before and after, of the ground that is held out and of that tuned on.
+
+    Args:
+        traverses: which cells are held out.
+        old: the cells of each traverse before.
+        new: the same cells after.
+        seed: of the bootstrap.
+    """
+    scores: dict[str, Any] = {}
+    calibration: dict[str, Any] = {}
+    for part, wanted in (("held_out", True), ("tuned_on", False)):
+        one, other = (_part(traverses, cells, held_out=wanted) for cells in (old, new))
+        scores[part] = score_with_intervals(one, other, seed=seed)
+        calibration[part] = {"before": calibration_rows(one), "after": calibration_rows(other)}
+    return {"scores": scores, "calibration": calibration}
+
+
+def _part(traverses: Sequence[Traverse], cells: Sequence[ScoredCells], *, held_out: bool) -> ScoredCells:
+    """Of the cells of all traverses, those that are held out, or those tuned on."""
+    parts = []
+    for one, mine in zip(traverses, cells, strict=True):
+        mask = np.asarray(one.arrays.held_out)[np.asarray(one.arrays.truth.counted)] == held_out
+        parts.append(ScoredCells(*(column[mask] for column in mine)))
+    return joined(parts)
+
+
+def write_result(
+    out: Path,
+    read: Sequence[tuple[Source, Plan, Traverse]],
+    target: str,
+    before: dict[str, Any],
+    records: Sequence[dict[str, Any]],
+) -> dict[str, Any]:
+    """Writes the JSON and the page of a tuning beside its configuration, and returns what the JSON holds.
+
+    Args:
+        out: the configuration.
+        read: what was tuned on.
+        target: name of the class that is scored.
+        before: the numbers tuned, as they were.
+        records: of each descent.
+    """
+    findings = [f"{plan.sequence.name}: {finding_line(one)}" for _, plan, _ in read for one in plan.findings]
+    result = {
+        "jaxmap_version": jaxmap.__version__,
+        "class": target,
+        "labeller": read[0][1].labeller.name,
+        "traverses": [
+            {
+                "sequence": plan.source,
+                "ground_truth": str(source.truth),
+                "frames": len(plan.sequence.frames),
+                "cells": int(np.asarray(one.arrays.truth.counted).sum()),
+                "held_out_cells": int(np.asarray(one.arrays.truth.counted & one.arrays.held_out).sum()),
+            }
+            for source, plan, one in read
+        ],
+        "before": before,
+        "stages": list(records),
+        "notes": [*findings, *(note for record in records for note in descent_notes(record))],
+    }
+    write_json(out.with_suffix(".json"), result)
+    with atomic_path(out.with_suffix(".html")) as temporary:
+        temporary.write_text(tuning_page(out.stem, result), encoding="utf-8", errors="backslashreplace")
+    return result
 
 
 class TuningRun:
@@ -208,47 +338,15 @@ class TuningRun:
         """
         done = 0
         for source, plan in zip(self._sources, self._plans, strict=True):
-            recipe = CacheRecipe(plan.front_end.camera, plan.grid, plan.labeller, plan.rule, plan.depth_range_m)
-            class_map = class_layer_of(
-                plan.mapper.init(),
-                plan.params.fusion,
-                plan.rule,
-                self._truth.target,
-                site_origin=plan.sequence.site_origin,
-                crs=plan.sequence.crs,
-            )
-            raster = read_truth([source.truth], class_map.place, self._truth)
-            for note in raster.notes:
-                self._notify(f"note: {note}")
 
-            def frames(plan: Plan = plan) -> Any:
+            def on_frame(prepared: PreparedFrame, plan: Plan = plan) -> None:
                 nonlocal done
-                for prepared in plan.prepare():
-                    if prepared.frame is not None:
-                        yield prepared.frame
-                    elif prepared.fault is not None and self._config.strict:
-                        raise prepared.fault
-                    else:
-                        self._notify(f"skipped {prepared.ref.name}: {prepared.fault}")
-                    done += 1
-                    advance(done)
+                done += 1
+                advance(done)
 
-            cache = build_cache(recipe, frames(), plan.params, plan.key, block_px=self._options.block_px)
-            options = self._options
-            self._traverses.append(
-                make_traverse(
-                    plan.sequence.name,
-                    recipe,
-                    cache,
-                    raster,
-                    plan.sequence.site_origin,
-                    plan.sequence.crs,
-                    cell_size_m=options.cell_size_m,
-                    rock_fraction=options.loss.rock_fraction,
-                    held_out_share=options.held_out_share,
-                    seed=options.seed,
-                )
-            )
+            strict = self._config.strict
+            frames = usable_frames(plan.prepare(), strict=strict, notify=self._notify, on_frame=on_frame)
+            self._traverses.append(read_traverse(source, plan, frames, self._truth, self._options, notify=self._notify))
         check_classes(self._traverses, self._truth.target)
 
     def tune(self, advance: Callable[[int, str], None]) -> dict[str, Any]:
@@ -271,26 +369,9 @@ class TuningRun:
 
             stages.append(self._stage("with kernel", before, start, further))
         self._write_config(stages[-1].params)
-        result = {
-            "jaxmap_version": jaxmap.__version__,
-            "class": self._truth.target,
-            "labeller": self._plans[0].labeller.name,
-            "traverses": self._describe_traverses(),
-            "before": plain(before),
-            "stages": [stage.record for stage in stages],
-            "notes": [
-                *(
-                    f"{plan.sequence.name}: {finding_line(finding)}"
-                    for plan in self._plans
-                    for finding in plan.findings
-                ),
-                *(note for stage in stages for note in descent_notes(stage.record)),
-            ],
-        }
-        write_json(self._out.with_suffix(".json"), result)
-        with atomic_path(self._out.with_suffix(".html")) as temporary:
-            temporary.write_text(tuning_page(self._out.stem, result), encoding="utf-8", errors="backslashreplace")
-        return result
+        read = list(zip(self._sources, self._plans, self._traverses, strict=True))
+        records = [stage.record for stage in stages]
+        return write_result(self._out, read, self._truth.target, plain(before), records)
 
     def _stage(self, name: str, before: TunedParams, start: TunedParams, advance: Callable[[int, str], None]) -> _Stage:
         """One descent from `start`, the best so far written at every step; reported beside `before`."""
@@ -320,25 +401,8 @@ class TuningRun:
             "parameters": plain(after),
             "history": history,
         }
-        record |= {"history": history, "scores": {}, "calibration": {}}
         old, new = ([score_cells(one, params, self._target) for one in self._traverses] for params in (before, after))
-        for part, wanted in (("held_out", True), ("tuned_on", False)):
-            one, other = (self._part(cells, wanted) for cells in (old, new))
-            record["scores"][part] = score_with_intervals(one, other, seed=self._options.seed)
-            record["calibration"][part] = {"before": calibration_rows(one), "after": calibration_rows(other)}
-        return _Stage(after, record)
-
-    def _describe_traverses(self) -> list[dict[str, Any]]:
-        return [
-            {
-                "sequence": plan.source,
-                "ground_truth": str(source.truth),
-                "frames": len(plan.sequence.frames),
-                "cells": int(np.asarray(one.arrays.truth.counted).sum()),
-                "held_out_cells": int(np.asarray(one.arrays.truth.counted & one.arrays.held_out).sum()),
-            }
-            for plan, source, one in zip(self._plans, self._sources, self._traverses, strict=True)
-        ]
+        return _Stage(after, record | scores_of_parts(self._traverses, old, new, self._options.seed))
 
     def _moves(self, free: TunedParams) -> TunedParams:
         """1 for what moves, 0 for what is frozen or acts on nothing under the rule."""
@@ -352,14 +416,6 @@ class TuningRun:
 
     def _write_config(self, params: TunedParams) -> None:
         write_yaml(self._out, mapping_tree(tuned_config(self._config, params)))
-
-    def _part(self, cells: list[ScoredCells], held_out: bool) -> ScoredCells:
-        """Of the cells of all traverses, those that are held out, or those tuned on."""
-        parts = []
-        for one, mine in zip(self._traverses, cells, strict=True):
-            mask = np.asarray(one.arrays.held_out)[np.asarray(one.arrays.truth.counted)] == held_out
-            parts.append(ScoredCells(*(column[mask] for column in mine)))
-        return joined(parts)
 
 
 class _Stage(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from threading import Lock
-from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Array, Float, Shaped
 from jaxmap.errors import FrameError
 from jaxmap.matching.design import Cost, MatchDesign, MatchParams, make_match_params
 from jaxmap.matching.match import match
+from jaxmap.matching.mccnn import load_cost_network
 from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.types import to_device
 
@@ -37,7 +37,11 @@ class JaxMatcher:
     """
 
     def __init__(self, options: StereoOptions, width_px: int) -> None:
-        """Decides on a design for images of this width."""
+        """Decides on a design for images of this width.
+
+        Raises:
+            JaxmapError: the weights of the cost network cannot be read.
+        """
         self.options = options
         self.design, self.params = match_design(options, width_px), match_params(options)
         self.num_disparities = self.design.num_disparities
@@ -72,8 +76,13 @@ def _matched(
     return match(design, left, right, params)
 
 
-def match_params(options: StereoOptions, weights: Any = None) -> MatchParams:
-    """The numbers that the options of stereo name; `weights` are those of the cost network."""
+def match_params(options: StereoOptions) -> MatchParams:
+    """The numbers that the options of stereo name, and the weights of the cost network where they name one.
+
+    Raises:
+        JaxmapError: these weights cannot be read.
+    """
+    weights = load_cost_network(options.cost_network) if options.matcher == "mccnn" else None
     return make_match_params(
         _cost(options),
         p1=options.step_penalty,
@@ -92,6 +101,7 @@ def match_design(options: StereoOptions, width_px: int) -> MatchDesign:
         num_disparities=options.num_disparities or -(-width_px // (8 * 16)) * 16,
         paths=options.paths,
         soft=options.soft,
+        kernels=options.kernels,
         # The network itself sees a block.
         block_size=1 if options.matcher == "mccnn" else options.block_size,
         pre_filter_cap=options.pre_filter_cap,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import fields
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ _SUBPIXELS = 16
 _MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
 """OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
 _OF_OPENCV = ("mode", "p1", "p2", "pad_left")
-_OF_STEP = ("cost", "paths", "step_penalty", "jump_penalty", "soft", "temperature")
+_OF_STEP = ("cost", "paths", "step_penalty", "jump_penalty", "soft", "temperature", "kernels")
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 """Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
@@ -49,6 +50,12 @@ class StereoOptions:
     """matchers sgm, mccnn: soft minima, slower, through which gradients reach images and penalties."""
     temperature: Annotated[float, Interval(ge=1e-4, le=10)] = 0.05
     """How soft, in units of the cost."""
+    kernels: bool = True
+    """matchers sgm, mccnn, on a CUDA device: kernels made for it, which need compute capability 8.0 (Ampere); without
+    them the same disparities take thirty times as long."""
+    cost_network: Path | None = None
+    """matcher mccnn: a file of the network's weights (.safetensors, .pt, .onnx); by default those that come with the
+    package mccnn."""
     mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
     min_disparity_px: Annotated[int, count(1024, least=-1024)] = 0
@@ -105,7 +112,7 @@ class StereoOptions:
     def _refuse_what_means_nothing(self) -> None:
         """Refuses options that differ from their defaults and belong to another matcher."""
         others = _OF_OPENCV if self.matcher != "opencv" else _OF_STEP
-        others = (*others, "cost", "block_size") if self.matcher == "mccnn" else others
+        others += ("cost", "block_size") if self.matcher == "mccnn" else ("cost_network",)
         for one in fields(self):
             if one.name in others and getattr(self, one.name) != one.default:
                 raise _bad(

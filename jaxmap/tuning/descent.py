@@ -54,22 +54,39 @@ def descend(
         JaxmapError: a loss or a gradient is not finite, or the loss has grown a hundredfold; the steps before were
             handed to `on_step`.
     """
+    slope = jax.jit(jax.value_and_grad(loss, has_aux=True))
+    return follow(lambda free: slope(free, *data), start, options, moves=moves, on_step=on_step)
+
+
+def follow(
+    slope: Callable[[PyTree], tuple[tuple[jax.Array, jax.Array], PyTree]],
+    start: PyTree,
+    options: DescentOptions,
+    *,
+    moves: PyTree | None = None,
+    on_step: Callable[[Step], None] = lambda step: None,
+) -> Step:
+    """The same along any gradient: `slope` gives both losses, and the gradient of the first.
+
+    Raises:
+        JaxmapError: as of `descend`.
+    """
     schedule = optax.cosine_decay_schedule(options.learning_rate, options.steps)
     optimiser = optax.chain(optax.clip_by_global_norm(options.max_norm), optax.adam(schedule))
 
     @jax.jit
-    def advance(free: PyTree, state: PyTree, data: tuple) -> tuple[PyTree, PyTree, tuple[jax.Array, ...]]:
-        (tuned, held_out), gradient = jax.value_and_grad(loss, has_aux=True)(free, *data)
+    def advance(free: PyTree, state: PyTree, gradient: PyTree) -> tuple[PyTree, PyTree, jax.Array]:
         if moves is not None:
             gradient = jax.tree.map(jnp.multiply, gradient, moves)
         updates, state = optimiser.update(gradient, state, free)
         finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all()
-        return optax.apply_updates(free, updates), state, (tuned, held_out, finite)
+        return optax.apply_updates(free, updates), state, finite
 
     free, state = start, optimiser.init(start)
     best, first = None, math.inf
     for number in range(options.steps + 1):
-        moved, state, (tuned, held_out, finite) = advance(free, state, data)
+        (tuned, held_out), gradient = slope(free)
+        moved, state, finite = advance(free, state, gradient)
         losses = Losses(float(tuned), float(held_out))
         if number == 0:
             first = abs(losses.tuned) + 1.0

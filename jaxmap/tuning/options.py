@@ -67,6 +67,11 @@ class TuneOptions:
     """The optimiser."""
     loss: Annotated[MapLossOptions, tyro.conf.arg(name="")] = field(default_factory=MapLossOptions)
     """The terms of the loss."""
+    through: Literal["fusion", "stereo"] = "fusion"
+    """What is tuned: the numbers of fusion and labels, or those of stereo matching (penalties, uniqueness, the weights
+    of a cost network) by the map that comes out; --stereo.matcher then is sgm or mccnn."""
+    smaller: Literal[1, 2, 4] = 2
+    """Through stereo: match images so many times smaller while tuning; scores are of full size."""
     held_out_share: Annotated[float, Interval(gt=0, lt=1)] = 0.25
     """Share of the ground that is held out, in blocks of 2 m and whole rocks."""
     kernel: Literal[0, 3, 5, 7, 9] = 0

@@ -1,0 +1,192 @@
+"""The evidence of a frame as a smooth function of how its images are matched, and the gradient of a map's score.
+
+Which voxel a point falls into, as `mapping.step` decides it, is flat: disparity may move within a voxel and nothing
+changes. So points are shared out among the nearest voxels (`fusion.splat`), and disparity has gradients by three ways:
+where points lie, what class their heights give them, and how much they count, which is their confidence. With the
+weights alone a penalty that smooths sand would gain nothing: its worth lies in heights. What a frame decides as a whole
+(a plane, which voxels were seen through, the checks of the matcher) is taken as given at every step.
+
+Disparity changes with every step, so nothing can be cached, as `tuning.evidence_cache` does. The gradient is pulled
+back frame by frame (see `tuning.pull_back`): each frame is matched twice, and the memory is that of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxmap.fusion.carve import carve
+from jaxmap.fusion.sensor_model import frame_evidence, point_weights
+from jaxmap.fusion.splat import splat_trilinear
+from jaxmap.geometry.cloud import project
+from jaxmap.geometry.grid import view_window
+from jaxmap.labellers.base import fusible, labels_of
+from jaxmap.mapping.step import Mapper, MapperParams, StepDesign
+from jaxmap.matching.design import MatchParams
+from jaxmap.matching.match import grey
+from jaxmap.matching.soft import soft_match
+from jaxmap.tuning.map_loss import cells_loss, soft_cells
+from jaxmap.tuning.options import MapLossOptions
+from jaxmap.tuning.soft_view import soft_columns_of_map
+from jaxmap.tuning.traverse_loss import Traverse
+from jaxmap.types import Frame, GridSpec, PointLabels
+
+Losses = tuple[Float[Array, ""], Float[Array, ""]]
+"""Of the ground that is tuned on, and of what is held out."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoTraverse:
+    """A traverse whose frames are matched anew at every step.
+
+    Attributes:
+        scored: the cells that count, and how they are scored.
+        mapper: of the small frames; its design matches softly.
+        frames: small (`tuning.small_frames`).
+        params: all numbers, those of matching at their start.
+        key: that of the map.
+        times: how many times smaller the frames are: a pixel stands for so many squared.
+    """
+
+    scored: Traverse
+    mapper: Mapper
+    frames: list[Frame]
+    params: MapperParams
+    key: PRNGKeyArray
+    times: int
+
+
+class StereoGradient(NamedTuple):
+    """`(match) -> (losses, gradient of the first)`, and `lower`: that of one frame, for its memory."""
+
+    of: Callable[[MatchParams], tuple[Losses, MatchParams]]
+    lower: Callable[[], jax.stages.Lowered]
+
+
+def soft_evidence(
+    design: StepDesign, grid: GridSpec, frame: Frame, params: MapperParams, frame_key: PRNGKeyArray, times: int = 1
+) -> tuple[Float[Array, "C1 X Y Z"], GridSpec]:
+    """What a frame says of the voxels of its window; differentiable in `params.match`.
+
+    It is what the step makes of the frame (`mapping.step.see_frame`), but for soft matching and shared-out points.
+
+    Args:
+        design: of the step; its matching is soft.
+        grid: of the map.
+        frame: with both images.
+        params: the numbers.
+        frame_key: of the frame.
+        times: how many times smaller the images are.
+    """
+    assert design.match is not None and params.match is not None
+    assert frame.image is not None and frame.right_image is not None
+    labeller, rule, depth_range_m = design.labeller, design.rule, design.depth_range_m
+    camera, pose, fusion = params.camera, frame.T_world_camera, params.fusion
+    left, right = grey(frame.image), grey(frame.right_image)
+    matched = soft_match(design.match, left, right, params.match)
+    disparity_px = matched.disparity_px
+    if frame.blind is not None:
+        disparity_px = jnp.where(frame.blind, jnp.nan, disparity_px)
+    cloud = project(camera, pose, disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
+
+    features = labeller.features(frame, cloud, params.labeller, frame_key)
+    numbers = params.labeller.numbers
+    estimate = jax.lax.stop_gradient(labeller.estimate(features.of_frame, numbers))
+    labels = fusible(labels_of(labeller, features, estimate, numbers), labeller.classes, rule)
+
+    window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
+    free = None
+    if rule.carve:
+        depth_m, sure = jax.lax.stop_gradient((cloud.depth_m, cloud.valid & (matched.confidence >= 0.5)))
+        free = carve(camera, pose, depth_m, sure, window, fusion, depth_range_m)
+    weights = point_weights(grid, cloud, rule) * matched.confidence.reshape(-1) * times**2
+    rows = _shares(labels, len(labeller.classes)) * weights
+    counts = splat_trilinear(window, cloud.points_world, rows, labels.keep)
+    return frame_evidence(counts, free, fusion, rule), window
+
+
+def _shares(labels: PointLabels, classes: int) -> Float[Array, "C1 N"]:
+    """The probability of each class for each point, and of none."""
+    if labels.probabilities is None:
+        assert labels.labels is not None
+        known = (labels.labels[None] == jnp.arange(classes)[:, None]).astype(jnp.float32)
+    else:
+        known = labels.probabilities.T
+    return jnp.concatenate([known, 1.0 - known.sum(0, keepdims=True)])
+
+
+def stereo_losses(
+    log_odds: Float[Array, "K X Y Z"], traverse: StereoTraverse, target: int, options: MapLossOptions
+) -> Losses:
+    """The losses of the map of a traverse: of the ground tuned on, and of what is held out.
+
+    A cell that was observed at the start counts, whatever is made of it later: no numbers gain by refusing to look.
+    """
+    fusion, rule, arrays = traverse.params.fusion, traverse.mapper.design.rule, traverse.scored.arrays
+    voxel_map = replace(traverse.mapper.init(), log_odds=log_odds)
+    columns = soft_columns_of_map(voxel_map, fusion, rule, target, options.softness)
+    said = soft_cells(columns, arrays.truth.shares, jax.nn.sigmoid(fusion.class_prior[target]), options)
+    counted = arrays.truth.counted
+    tuned, held_out = (
+        cells_loss(said, arrays.truth._replace(counted=counted & mask), options)[0]
+        for mask in (~arrays.held_out, arrays.held_out)
+    )
+    return tuned, held_out
+
+
+def make_stereo_gradient(traverse: StereoTraverse, target: int, options: MapLossOptions) -> StereoGradient:
+    """Builds the gradient of the loss of a traverse; compiled once for all frames and steps.
+
+    Args:
+        traverse: its frames and its truth.
+        target: index of the class that is scored.
+        options: the terms of the loss.
+    """
+    design, key, times = traverse.mapper.design, traverse.key, traverse.times
+    empty = traverse.mapper.init()
+
+    def evidence(match: MatchParams, frame: Frame, number: Int[Array, ""] | int) -> tuple[Array, GridSpec]:
+        params = replace(traverse.params, match=match)
+        return soft_evidence(design, empty.grid, frame, params, jax.random.fold_in(key, number), times)
+
+    def place(window: GridSpec) -> tuple[Array, ...]:
+        return (jnp.zeros((), jnp.int32), *(window.first - empty.grid.first))
+
+    def add(log_odds: Array, match: MatchParams, frame: Frame, number: Int[Array, ""] | int) -> Array:
+        said, window = evidence(match, frame, number)
+        here = jax.lax.dynamic_slice(log_odds, place(window), said.shape)
+        return jax.lax.dynamic_update_slice(log_odds, here + said, place(window))
+
+    def score(log_odds: Array) -> tuple[Losses, Array]:
+        return jax.value_and_grad(lambda log_odds: stereo_losses(log_odds, traverse, target, options), has_aux=True)(
+            log_odds
+        )
+
+    def pull(
+        gradient: MatchParams, cotangent: Array, match: MatchParams, frame: Frame, number: Int[Array, ""] | int
+    ) -> MatchParams:
+        said, back, window = jax.vjp(lambda match: evidence(match, frame, number), match, has_aux=True)
+        here = jax.lax.dynamic_slice(cotangent, place(window), said.shape)
+        return jax.tree.map(jnp.add, gradient, back(here)[0])
+
+    add_one, pull_one = jax.jit(add, donate_argnums=0), jax.jit(pull, donate_argnums=0)
+    score_map = jax.jit(score)
+
+    def of(match: MatchParams) -> tuple[Losses, MatchParams]:
+        log_odds = jnp.zeros_like(empty.log_odds)
+        for number, frame in enumerate(traverse.frames):
+            log_odds = add_one(log_odds, match, frame, number)
+        losses, cotangent = score_map(log_odds)
+        gradient = jax.tree.map(jnp.zeros_like, match)
+        for number, frame in enumerate(traverse.frames):
+            gradient = pull_one(gradient, cotangent, match, frame, number)
+        return losses, gradient
+
+    match = traverse.params.match
+    assert match is not None
+    return StereoGradient(of, lambda: pull_one.lower(match, empty.log_odds, match, traverse.frames[0], 0))

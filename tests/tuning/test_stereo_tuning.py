@@ -1,0 +1,191 @@
+"""Tuning through stereo: its gradient is that of the loss, numbers keep their ranges, files are what map reads."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+import yaml
+from fixtures import cli, scene_folder, shared_cache  # noqa: F401
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import scene_frame
+from small_scenes import small_camera as camera_of
+from tune_faults import tune_words, write_truth
+
+from jaxmap.evaluation.cells import column_shares, make_cells
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import make_fusion_params
+from jaxmap.geometry.camera import points_to_pixels
+from jaxmap.labellers.files import make_files_labeller
+from jaxmap.labels import ROVER_CLASSES
+from jaxmap.mapping.step import MapperParams, make_mapper
+from jaxmap.matching.design import MOST_P1, MOST_P2, MatchDesign, make_match_params
+from jaxmap.runs.config import load_config
+from jaxmap.stereo.front_end import RectifiedFrame
+from jaxmap.tuning.evidence_cache import CacheRecipe
+from jaxmap.tuning.map_loss import MapTruth
+from jaxmap.tuning.options import MapLossOptions
+from jaxmap.tuning.small_frames import small_camera, small_design, small_frame
+from jaxmap.tuning.stereo_evidence import StereoTraverse, make_stereo_gradient
+from jaxmap.tuning.stereo_params import free_match, matched_by
+from jaxmap.tuning.traverse_loss import Traverse, TraverseArrays
+from jaxmap.types import Frame, make_grid, make_stereo_camera
+
+THROUGH = ("--through", "stereo", "--stereo.matcher", "sgm")
+EVERY_PX = 4
+
+
+def doubled(tree: object) -> object:
+    """Every float in double precision."""
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+
+
+def small_traverse() -> StereoTraverse:
+    """Two views of the scene, small, with textured images, and truth of the scene from above."""
+    camera = camera_of(EVERY_PX)
+    grid = make_grid([-1.6, 0.4, -0.4], [1.6, 4.4, 1.2], 0.4)
+    rule = FusionRule()
+    labeller = make_files_labeller(ROVER_CLASSES, soft=True)
+    design = MatchDesign(num_disparities=12, soft=True, census_window_px=(3, 5), edge_step_px=0.0, speckle_window_px=0)
+    design = replace(design, left_right_max_diff_px=-1)
+    mapper = make_mapper(camera, grid, labeller, rule, (0.3, 4.0), match=design)
+    rng = np.random.default_rng(6)
+    frames = []
+    for index in range(2):
+        seen = scene_frame(index)
+        images = [
+            image[: camera.height_px * EVERY_PX : EVERY_PX, : camera.width_px * EVERY_PX : EVERY_PX] + rng.uniform(0, 9)
+            for image in (seen.left, seen.right)
+        ]
+        labels = np.eye(len(ROVER_CLASSES))[seen.labels[::EVERY_PX, ::EVERY_PX]] * 0.8 + 0.05
+        pose = jaxlie.SE3.from_matrix(jnp.asarray(seen.T_world_camera, jnp.float32))
+        grey = [jnp.asarray(image, jnp.float32).reshape(*image.shape[:2], -1).mean(-1) for image in images]
+        soft = jnp.asarray(labels, jnp.float32)
+        frames.append(Frame(None, pose, image=grey[0], right_image=grey[1], class_probabilities=soft))
+    cells = make_cells(grid, 0.4)
+    shape = grid.shape[:2]
+    truly = jnp.asarray(rng.uniform(size=shape) < 0.4, jnp.float32)
+    truth = MapTruth(column_shares(grid, cells), truly, jnp.ones(shape, bool))
+    recipe = CacheRecipe(camera, grid, labeller, rule, (0.3, 4.0))
+    held_out = jnp.asarray(rng.uniform(size=shape) < 0.3)
+    arrays = TraverseArrays(None, truth, held_out)  # type: ignore[arg-type]
+    scored = Traverse("scene", recipe, arrays, np.zeros(shape, np.int32), 0.5)
+    params = MapperParams(camera, make_fusion_params(ROVER_CLASSES), match=make_match_params(temperature=0.05))
+    return StereoTraverse(scored, mapper, frames, params, jax.random.key(0), EVERY_PX)
+
+
+@pytest.mark.slow
+def test_the_gradient_is_that_of_the_loss():
+    """Against finite differences, in double precision, with decisions that hold still."""
+    with jax.enable_x64(True):
+        traverse = small_traverse()
+        frames, params = (doubled(part) for part in (traverse.frames, traverse.params))
+        mapper = traverse.mapper._replace(init=lambda empty=traverse.mapper.init: doubled(empty()))
+        traverse = replace(traverse, frames=frames, params=params, mapper=mapper)
+        gradient = make_stereo_gradient(traverse, ROVER_CLASSES.index("rock"), MapLossOptions())
+        match = traverse.params.match
+        assert match is not None
+        (tuned, held_out), slopes = gradient.of(match)
+        assert float(tuned) != float(held_out)
+        for name in ("p1", "p2", "uniqueness", "temperature"):
+            step = 1e-6
+            moved = [replace(match, **{name: getattr(match, name) + sign * step}) for sign in (1, -1)]
+            difference = (gradient.of(moved[0])[0][0] - gradient.of(moved[1])[0][0]) / (2 * step)
+            np.testing.assert_allclose(getattr(slopes, name), difference, rtol=1e-3, atol=1e-6, err_msg=name)
+            assert abs(float(difference)) > 0
+
+
+@given(numbers=st.tuples(*[st.floats(-9, 9, width=32)] * 3))
+def test_numbers_stay_in_their_ranges(numbers):
+    start = make_match_params("census")
+    free = dict(zip(("step_penalty", "jump_penalty", "uniqueness"), map(jnp.float32, numbers), strict=True))
+    match = matched_by(free | {"cost_network": {}}, start)
+    assert 0 < match.p1 < match.p2 <= MOST_P2 and match.p1 <= MOST_P1
+    assert 0 <= match.uniqueness < 1
+    assert match.temperature == start.temperature
+
+
+def test_the_start_is_where_the_settings_are():
+    weights = (jnp.arange(6.0).reshape(2, 3),)
+    start = make_match_params("mccnn", p1=0.08, p2=0.4, uniqueness=0.12, weights=weights)
+    match = matched_by(free_match(start), start)
+    for ours, expected in zip(jax.tree.leaves(match), jax.tree.leaves(start), strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("times", [1, 2, 4])
+def test_a_small_camera_sees_the_same(times):
+    camera = make_stereo_camera(
+        fx_px=300, cx_px=80.5, cy_px=61, baseline_m=0.2, doffs_px=3, width_px=163, height_px=122
+    )
+    point = jnp.array([0.3, -0.2, 2.5])
+    u_px, v_px, disparity_px, _ = points_to_pixels(camera, point)
+    small_u, small_v, small_disparity, _ = points_to_pixels(small_camera(camera, times), point)
+    np.testing.assert_allclose([small_u, small_v], [(u_px + 0.5) / times - 0.5, (v_px + 0.5) / times - 0.5], rtol=1e-5)
+    np.testing.assert_allclose(small_disparity, disparity_px / times, rtol=1e-5)
+
+
+def test_a_small_design_searches_the_same_depths():
+    design = MatchDesign(min_disparity_px=-3, num_disparities=50, speckle_window_px=100, edge_window_px=7, block_size=9)
+    small = small_design(design, 4)
+    assert small.soft
+    assert (small.min_disparity_px, small.min_disparity_px + small.num_disparities) == (-1, 12)
+    assert (small.speckle_window_px, small.edge_window_px, small.block_size) == (6, 1, 3)
+
+
+def test_a_small_frame_is_made_of_means():
+    rng = np.random.default_rng(3)
+    left, right = (rng.integers(0, 255, (9, 11, 3)).astype(np.uint8) for _ in range(2))
+    labels = jnp.asarray(rng.integers(0, 3, (9, 11)), jnp.uint8)
+    blind = rng.uniform(size=(9, 11)) < 0.5
+    frame = Frame(jnp.zeros((9, 11)), jaxlie.SE3.identity(), labels=labels)
+    small = small_frame(frame, RectifiedFrame(left, right, None, 0.0, 0.0, blind=blind), 2)
+    assert small.disparity_px is None and small.image is not None and small.right_image is not None
+    assert small.image.shape == (4, 5, 3)
+    np.testing.assert_allclose(small.image[1, 2], left[2:4, 4:6].mean((0, 1)), atol=0.51)
+    np.testing.assert_array_equal(small.labels, labels[1:9:2, 1:10:2])
+    np.testing.assert_array_equal(small.blind, blind[1:9:2, 1:10:2])
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--through", "stereo"), "OpenCV's matcher passes no gradient"),
+        ((*THROUGH, "--kernel", "3"), "--kernel is of the fusion"),
+        ((*THROUGH, "--stereo.soft"), "a map is matched with hard minima"),
+        ((*THROUGH, "--fusion.per-frame", "once"), "passes no gradient"),
+        ((*THROUGH, "--frozen", "class_prior"), "name some of step_penalty jump_penalty"),
+    ],
+)
+def test_what_does_not_serve_is_refused(cli, scene_folder, tmp_path, words, told):
+    outcome = cli(*tune_words(scene_folder, write_truth(tmp_path / "truth.tif"), tmp_path / "stereo.yaml", *words))
+    assert outcome.status == 2
+    assert told in outcome.error
+    assert not (tmp_path / "stereo.yaml").exists()
+
+
+@pytest.mark.slow
+def test_it_writes_what_map_reads(cli, scene_folder, tmp_path):
+    out = tmp_path / "stereo.yaml"
+    truth = write_truth(tmp_path / "truth.tif")
+    small = ("--steps", "2", "--held-out-share", "0.4", "--smaller", "2", "--stop", "3")
+    outcome = cli(*tune_words(scene_folder, truth, out, *THROUGH, *small, "--frozen", "uniqueness"))
+    assert outcome.status == 0, outcome
+    tree = yaml.safe_load(out.read_text())
+    assert tree["stereo"]["matcher"] == "sgm" and not tree["stereo"]["soft"]
+    assert tree["stereo"]["uniqueness_ratio"] == 10
+    config = load_config(str(out))
+    told = json.loads(out.with_suffix(".json").read_text())
+    (stage,) = told["stages"]
+    assert config.stereo.step_penalty == pytest.approx(stage["parameters"]["step_penalty"], abs=1e-5)
+    assert len(stage["history"]) == 3
+    losses = [row["loss"] for row in stage["history"]]
+    assert np.isfinite(losses).all() and len(set(losses)) == 3
+    assert stage["scores"]["held_out"]["iou"]["before"] is not None
+    assert out.with_suffix(".html").exists() and not out.with_suffix(".safetensors").exists()
