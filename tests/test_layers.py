@@ -13,8 +13,8 @@ FLOORS = (
     "errors types labels",
     # the host's files, threads, memory and settings
     "host",
-    # pure geometry
-    "geometry localisation",
+    # pure geometry; what is compiled from C++
+    "geometry localisation native",
     "models stereo fusion profiling",
     # what labels points, what doubts a map, what reads logs
     "labellers ensemble datasets",
