@@ -60,17 +60,19 @@ class InARow(Protocol):
 
 def apply_fused(module: InARow, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
     """The module's result, by the kernel where it fits; the two differ by rounding alone."""
-    if math.prod(images.shape[:3]) < LEAST_PIXELS or not _is_known(module.blocks, images) or not has_kernel():
+    if not fits(module.blocks, images):
         return module.plain(images)
-    return _fused(*nnx.split(cast(nnx.Module, module)), images)
+    graph, state = nnx.split(cast(nnx.Module, module))
+    return _fused(graph, state, images)
 
 
-def _is_known(blocks: Sequence[Convolution], images: Array) -> bool:
-    """Whether batch norms are folded, kernels are not transformed, and all numbers are float32."""
-    return images.dtype == jnp.float32 and all(
+def fits(blocks: Sequence[Convolution], images: Array) -> bool:
+    """Whether there is a kernel, norms are folded, kernels are not transformed, and all numbers are float32."""
+    known = images.dtype == jnp.float32 and all(
         block.norm is None and block.kernel.shape[0] == block.size and block.kernel.dtype == jnp.float32
         for block in blocks
     )
+    return known and math.prod(images.shape[:3]) >= LEAST_PIXELS and has_kernel()
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -82,21 +84,15 @@ def _fused(graph: Any, state: Any, images: Array) -> Array:
     rows, columns = (window.axis(size) for size in images.shape[1:3])
     shape = (images.shape[0], rows.outputs, columns.outputs, project.kernel.shape[3])
     layers = (expand, depthwise, project)
-    return jax.ffi.ffi_call(TARGET, jax.ShapeDtypeStruct(shape, jnp.float32), vmap_method="sequential")(
-        images,
-        *(array for layer in layers for array in _arrays(layer)),
+    kernel = partial(
+        jax.ffi.ffi_call(TARGET, jax.ShapeDtypeStruct(shape, jnp.float32), vmap_method="sequential"),
         window=np.array([rows.kernel, rows.stride, rows.dilation, rows.before, columns.before], np.int64),
         ranges=np.array([RANGES[layer.activation if layer else "none"] for layer in layers], np.float32).reshape(-1),
         shortcut=module.shortcut,
     )
-
-
-def _arrays(layer: Convolution | None) -> tuple[Array, Array]:
-    """Kernel and bias; empty where there is no layer."""
-    if layer is None:
-        return jnp.zeros(0, jnp.float32), jnp.zeros(0, jnp.float32)
-    kernel = layer.kernel[...]
-    return kernel, jnp.zeros(kernel.shape[3], jnp.float32) if layer.bias is None else layer.bias[...]
+    arrays = [array for layer in layers for array in _arrays(layer)]
+    # A program may be lowered for another device than this machine's.
+    return jax.lax.platform_dependent(images, *arrays, cpu=kernel, default=lambda images, *arrays: module.plain(images))
 
 
 def _fused_forward(graph: Any, state: Any, images: Array) -> tuple[Array, Any]:
@@ -105,3 +101,12 @@ def _fused_forward(graph: Any, state: Any, images: Array) -> tuple[Array, Any]:
 
 
 _fused.defvjp(_fused_forward, lambda graph, pull_back, cotangent: pull_back(cotangent))
+
+
+def _arrays(layer: Convolution | None) -> tuple[Array, Array]:
+    """Kernel and bias; empty where there is no layer."""
+    if layer is None:
+        nothing = jnp.zeros(0, jnp.float32)
+        return nothing, nothing
+    kernel = layer.kernel[...]
+    return kernel, jnp.zeros(kernel.shape[3], jnp.float32) if layer.bias is None else layer.bias[...]
