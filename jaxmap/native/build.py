@@ -15,11 +15,11 @@ import shutil
 import subprocess
 import tempfile
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
 
 import jax
-import jaxlib
 
 from jaxmap.host.cache import cache_folder
 
@@ -69,7 +69,7 @@ def _compiled() -> Path:
         raise OSError(f"no C++ compiler ({asked or ', '.join(_COMPILERS)}) on PATH")
     # What it defines for this processor names its version and the instructions that it may use.
     macros = _run(compiler, *_FLAGS, "-dM", "-E", "-x", "c++", os.devnull)
-    parts = (_SOURCE.read_text("utf-8"), macros, " ".join(_FLAGS), jaxlib.__version__)
+    parts = (_SOURCE.read_text("utf-8"), macros, " ".join(_FLAGS), version("jaxlib"))
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     library = cache_folder() / "native" / f"blocks-{name}.so"
     if not library.exists():
