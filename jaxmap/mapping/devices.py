@@ -166,7 +166,7 @@ def _batches(frames: Iterable[PreparedFrame], size: int, strict: bool) -> Iterat
 def _placed(frames: Sequence[Frame], mesh: Mesh) -> Batch:
     """The frames, each on its device; where they are too few, with frames in which nothing is seen."""
     devices, count = list(mesh.devices), len(frames)
-    blank = replace(frames[-1], disparity_px=jnp.full_like(frames[-1].disparity_px, jnp.nan))
+    blank = _seen_nothing(frames[-1])
     frames = [*frames, *[blank] * (len(devices) - count)]
 
     def placed(*leaves: Array) -> Array:
@@ -175,3 +175,11 @@ def _placed(frames: Sequence[Frame], mesh: Mesh) -> Batch:
         return jax.make_array_from_single_device_arrays(shape, NamedSharding(mesh, P(_AXIS)), parts)
 
     return Batch(jax.tree.map(placed, *frames), jax.device_put(to_device(count, np.int32), NamedSharding(mesh, P())))
+
+
+def _seen_nothing(frame: Frame) -> Frame:
+    """The frame without any disparity, be it brought or to be matched."""
+    if frame.disparity_px is not None:
+        return replace(frame, disparity_px=jnp.full_like(frame.disparity_px, jnp.nan))
+    assert frame.blind is not None
+    return replace(frame, blind=jnp.ones_like(frame.blind))

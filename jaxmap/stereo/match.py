@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,9 +13,10 @@ from jaxmap.errors import FrameError, UsageError
 from jaxmap.host.settings import NotNegative, count, options
 
 _SUBPIXELS = 16
-_FAR_PX = np.float32(1e6)
 _MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
 """OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
+_OF_OPENCV = ("mode", "p1", "p2", "pad_left")
+_OF_STEP = ("cost", "paths", "step_penalty", "jump_penalty", "soft", "temperature")
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 """Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
@@ -32,6 +34,21 @@ class StereoOptions:
     align: bool = False
     """Estimate a rotation of the right camera under which the rows of both images agree, from matches in some frames,
     and rectify all frames with it: for a calibration that is slightly off (`jaxmap check` says so)."""
+    matcher: Literal["opencv", "sgm", "mccnn"] = "opencv"
+    """OpenCV's on the host, or semi-global matching inside the compiled step, by hand-made costs or a network's."""
+    cost: Literal["census", "bt"] = "census"
+    """matcher sgm: compares the order of grey levels around two pixels, or grey levels (Birchfield-Tomasi)."""
+    paths: Literal[4, 8] = 8
+    """matchers sgm, mccnn: directions along which costs are aggregated."""
+    step_penalty: Annotated[float, Interval(ge=0, le=1)] | None = None
+    """matchers sgm, mccnn: cost of a disparity step of one, where the worst match costs 1; by default, what suits the
+    cost."""
+    jump_penalty: Annotated[float, Interval(ge=0, le=2)] | None = None
+    """matchers sgm, mccnn: cost of a greater step."""
+    soft: bool = False
+    """matchers sgm, mccnn: soft minima, slower, through which gradients reach images and penalties."""
+    temperature: Annotated[float, Interval(ge=1e-4, le=10)] = 0.05
+    """How soft, in units of the cost."""
     mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
     min_disparity_px: Annotated[int, count(1024, least=-1024)] = 0
@@ -83,6 +100,18 @@ class StereoOptions:
         p1, p2 = self.penalties()
         if not p1 < p2:
             raise _bad(f"p1 is {p1} and p2 is {p2}", "take 0 < p1 < p2")
+        self._refuse_what_means_nothing()
+
+    def _refuse_what_means_nothing(self) -> None:
+        """Refuses options that differ from their defaults and belong to another matcher."""
+        others = _OF_OPENCV if self.matcher != "opencv" else _OF_STEP
+        others = (*others, "cost") if self.matcher == "mccnn" else others
+        for one in fields(self):
+            if one.name in others and getattr(self, one.name) != one.default:
+                raise _bad(
+                    f"{one.name} is {getattr(self, one.name)}, which means nothing to the matcher {self.matcher}",
+                    f"leave it at {one.default}, or choose another --stereo.matcher",
+                )
 
     def penalties(self) -> tuple[int, int]:
         """The penalties p1 and p2 of disparity steps."""
@@ -122,27 +151,27 @@ class Matcher:
         if left.shape[:2] != right.shape[:2]:
             sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
             raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
-        left, right = _grey(left), _grey(right)
-        image_px = left.size
+        left, right = as_grey(left), as_grey(right)
         pad = max(self.num_disparities + self.options.min_disparity_px, 0) if self.options.pad_left else 0
-        left, right = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
-        raw = self._engine(image_px).compute(left, right)[:, pad:]
-        disparity_px = np.multiply(raw, np.float32(1 / _SUBPIXELS), dtype=np.float32)
-        np.copyto(disparity_px, np.nan, where=raw < self.options.min_disparity_px * _SUBPIXELS)
-        return self._without_edges(disparity_px)
+        padded = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
+        found = self.engine(left.size).compute(*padded)[:, pad:]
+        # Counted from the least that is searched; OpenCV's own mark of the unknown is less than all.
+        sixteenths = found - np.int16(self.options.min_disparity_px * _SUBPIXELS)
+        disparity_px = np.multiply(found, np.float32(1 / _SUBPIXELS), dtype=np.float32)
+        np.copyto(disparity_px, np.nan, where=(sixteenths < 0) | self._at_edges(sixteenths))
+        return disparity_px
 
-    def _without_edges(self, disparity_px: np.ndarray) -> np.ndarray:
-        """The same without pixels near a step of disparity."""
+    def _at_edges(self, sixteenths: np.ndarray) -> np.ndarray:
+        """Where a step of disparity is near; means nothing where disparity is unknown, which is negative."""
         import cv2
 
         if not self.options.edge_step_px:
-            return disparity_px
+            return np.zeros(sixteenths.shape, bool)
         square = np.ones((self.options.edge_window_px,) * 2, np.uint8)
-        unknown = np.isnan(disparity_px)
-        least = cv2.erode(np.where(unknown, _FAR_PX, disparity_px), square)
-        greatest = cv2.dilate(np.where(unknown, -_FAR_PX, disparity_px), square)
-        disparity_px[greatest - least > self.options.edge_step_px] = np.nan
-        return disparity_px
+        greatest = cv2.dilate(sixteenths, square)
+        # Without their sign, negative numbers are greater than all others.
+        least = cv2.erode(sixteenths.view(np.uint16), square).view(np.int16)
+        return cv2.subtract(greatest, least) > self.options.edge_step_px * _SUBPIXELS
 
     def looks_swapped(self, left: np.ndarray, right: np.ndarray, disparity_px: np.ndarray) -> bool:
         """Whether the pair matches far better with left and right exchanged."""
@@ -153,11 +182,11 @@ class Matcher:
         other_way = np.isfinite(self(right, left)).mean()
         return bool(other_way > 0.2 and other_way > 1.4 * valid)
 
-    def _engine(self, image_px: int) -> Any:
+    def engine(self, image_px: int) -> Any:
+        """OpenCV's matcher of grey images of so many pixels; each thread has its own, which reuses its buffers."""
         # Imported here, so that the command line can read the options without OpenCV.
         import cv2
 
-        # An engine reuses its buffers, so each thread has its own.
         if not hasattr(self._local, "engine"):
             options, unchecked = self.options, self.options.left_right_max_diff_px < 0
             p1, p2 = options.penalties()
@@ -182,7 +211,8 @@ class Matcher:
         return self._local.engine
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
+def as_grey(image: np.ndarray) -> np.ndarray:
+    """An image, grey or RGB, as grey (ITU-R 601 luma)."""
     import cv2
 
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
