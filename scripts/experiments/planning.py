@@ -163,7 +163,7 @@ class Tally(NamedTuple):
 def scored(costs: Costs, ends: np.ndarray, far_m: np.ndarray, radius_m: float, truth_m: float) -> Tally:
     """Plans one path and scores it."""
     try:
-        plan = plan_path(costs, *(ends + costs.attributes.site_origin[:2]))
+        plan = plan_path(costs, *(ends + costs.site.attributes.site_origin[:2]))
     except JaxmapError:
         return Tally(asked=1, refused=1)
     i, j = costs.terrain.cell_of(plan.places_m).T
@@ -179,7 +179,7 @@ def tallies_of(folder: Path, pairs: int, seed: int, rover: RoverOptions) -> dict
     in_view = np.asarray(seen_by["ours"].costs.unknown) <= IN_VIEW
     tallies = dict.fromkeys(seen_by, Tally())
     for ends in draw_pairs(seen_by["truth"], in_view, far_m < rover.radius_m + rover.margin_m, pairs, seed):
-        site = seen_by["truth"].attributes.site_origin[:2]
+        site = seen_by["truth"].site.attributes.site_origin[:2]
         truth_m = plan_path(seen_by["truth"], *(ends + site)).metrics["length_m"]
         for name, costs in seen_by.items():
             tallies[name] += scored(costs, ends, far_m, rover.radius_m, truth_m)
