@@ -13,8 +13,8 @@ FLOORS = (
     "errors types labels",
     # the host's files, threads, memory and settings
     "host",
-    # pure geometry
-    "geometry localisation",
+    # pure geometry; what is compiled from C++
+    "geometry localisation native",
     "models fusion profiling",
     # stereo matching in JAX, and the host's front end, which offers it beside OpenCV's
     "matching",

@@ -1,16 +1,29 @@
-"""DeepLabv3+ of segmentation_models_pytorch in torch, ONNX Runtime and OpenVINO: what our network is compared with."""
+"""DeepLabv3+ of segmentation_models_pytorch in torch, ONNX Runtime and OpenVINO: what our network is compared with.
+
+    python scripts/benchmarks/networks.py [--backbone mobilenet_v2] [--size 384 512] [--threads 2] [--rounds 25]
+
+prints our network with the compiled kernel and without it beside onnxruntime, all three with the same weights and in
+turn: wall time, processor time, their ratios, and the greatest difference of the logits. Processor time of several
+threads counts those of onnxruntime that wait by spinning; with `--threads 1` nobody waits.
+"""
 
 from __future__ import annotations
 
+import argparse
 import copy
 import io
+import os
+import statistics
 import sys
+import tempfile
+import time
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import Run
+from harness import PAUSE_S, Run, limit_threads
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -121,3 +134,68 @@ def training_step(layout: str, images: np.ndarray, labels: np.ndarray, threads: 
         return loss.item()
 
     return run
+
+
+def ours_with_their_weights(backbone: str, images: np.ndarray, *, kernel: bool) -> Run:
+    """The network as `jaxmap segment` runs it, with the weights of torch's; with or without the compiled kernel."""
+    import jax
+    from safetensors.numpy import save_file
+
+    from jaxmap.models.importers import import_weights
+    from jaxmap.models.network import inference_network
+
+    os.environ["JAXMAP_NATIVE"] = "1" if kernel else "0"
+    arrays = {name: array.numpy().copy() for name, array in torch_network(backbone).state_dict().items()}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "network.safetensors"
+        save_file(arrays, path)
+        imported = import_weights(path, classes=("first", "second", "third"))
+    network = inference_network(imported.architecture, imported.weights)
+    program = jax.jit(network.apply).lower(network.weights, images).compile()
+    return lambda: np.asarray(program(network.weights, images))
+
+
+def main() -> None:
+    """Times the three in turn and prints a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backbone", default="mobilenet_v2")
+    parser.add_argument("--size", type=int, nargs=2, default=(384, 512), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=25)
+    given = parser.parse_args()
+    limit_threads(given.threads)
+    images = np.random.default_rng(0).integers(0, 256, (1, *given.size, 3), np.uint8)
+    session = onnx_session(given.backbone, images, given.threads)
+    runs: dict[str, Callable[[], Any]] = {
+        "with the kernel": ours_with_their_weights(given.backbone, images, kernel=True),
+        "without": ours_with_their_weights(given.backbone, images, kernel=False),
+        "onnxruntime": lambda: np.moveaxis(session()[0], 1, -1),
+    }
+    logits = {name: run() for name, run in runs.items()}
+    times_ms: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
+    for _ in range(given.rounds):
+        for name, run in runs.items():
+            time.sleep(PAUSE_S)
+            wall_s, work_s = time.perf_counter(), time.process_time()
+            run()
+            times_ms[name].append((1e3 * (time.perf_counter() - wall_s), 1e3 * (time.process_time() - work_s)))
+    medians = {
+        name: [statistics.median(column) for column in zip(*times, strict=True)] for name, times in times_ms.items()
+    }
+    print(
+        f"{given.backbone}, {given.size[0]} x {given.size[1]}, {given.threads} threads, load {os.getloadavg()[0]:.1f}"
+    )
+    print(f"{'':16s}{'wall, ms':>10s}{'least':>8s}{'processor, ms':>15s}{'least':>8s}{'difference':>12s}")
+    theirs = medians["onnxruntime"]
+    for name, (wall_ms, work_ms) in medians.items():
+        least_wall_ms, least_work_ms = map(min, zip(*times_ms[name], strict=True))
+        difference = np.abs(logits[name] - logits["onnxruntime"]).max()
+        print(
+            f"{name:16s}{wall_ms:10.1f}{least_wall_ms:8.1f}{work_ms:15.1f}{least_work_ms:8.1f}{difference:12.1e}"
+            f"  of onnxruntime's: wall {wall_ms / theirs[0]:.2f}, processor {work_ms / theirs[1]:.2f}"
+        )
+    print(f"logits are up to {np.abs(logits['onnxruntime']).max():.1f}")
+
+
+if __name__ == "__main__":
+    main()
