@@ -86,10 +86,11 @@ def gather_heights(
 def combine(one: Float[Array, "4 X Y"], other: Float[Array, "4 X Y"]) -> Float[Array, "4 X Y"]:
     """The statistics of all the points of two frames, or of two maps on the same columns."""
     (count, mass, mean_m, square), (more, weight, height_m, scatter) = one, other
-    whole = jnp.maximum(mass + weight, _LEAST_WEIGHT)
+    # Of a column without points before, all is the frame's: to the last bit.
+    share = weight / jnp.maximum(mass + weight, _LEAST_WEIGHT)
     apart_m = height_m - mean_m
-    mean_m = mean_m + apart_m * weight / whole
-    return jnp.stack([count + more, mass + weight, mean_m, square + scatter + apart_m**2 * mass * weight / whole])
+    mean_m = mean_m + apart_m * share
+    return jnp.stack([count + more, mass + weight, mean_m, square + scatter + apart_m**2 * mass * share])
 
 
 def add_heights(voxel_map: VoxelMap, heights: Float[Array, "4 X Y"], window: GridSpec) -> Float[Array, "4 X Y"]:

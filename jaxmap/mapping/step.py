@@ -11,17 +11,17 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from jaxmap.ensemble.draws import EnsembleParams
 from jaxmap.ensemble.members import fuse_members
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.carve import carve
-from jaxmap.fusion.integrate import add_evidence, count_points
+from jaxmap.fusion.frame import Counted, Sighting
+from jaxmap.fusion.fused import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
-from jaxmap.fusion.surface import add_heights, gather_heights, height_sigma
+from jaxmap.fusion.sensor_model import point_weights
+from jaxmap.fusion.surface import height_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
@@ -95,18 +95,13 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
     return exact
 
 
-class FrameEvidence(NamedTuple):
-    """What one frame says, before it is added to a map.
+class SeenFrame(NamedTuple):
+    """What one frame shows, before it is added to a map: its labelled points, and the window of the map they lie in."""
 
-    `evidence` is that of the voxels of `window`; `labels` are those that its points are fused with;
-    `heights` are the statistics of the columns of the window, where they are kept.
-    """
-
-    evidence: Float[Array, "C1 X Y Z"]
+    sighting: Sighting
     window: GridSpec
-    labels: PointLabels
-    report: StepReport
-    heights: Float[Array, "4 X Y"] | None = None
+    in_range: Int[Array, ""]
+    estimate: PyTree
 
 
 @in_full_float32
@@ -115,24 +110,23 @@ def fuse_frame(
 ) -> tuple[VoxelMap, StepReport]:
     """The step itself: one frame into the map. `key` is the run's."""
     frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
-    seen = see_frame(design, voxel_map.grid, frame, params, frame_key)
-    fused = add_evidence(voxel_map, seen.evidence, seen.window)
+    seen, rule = see_frame(design, voxel_map.grid, frame, params, frame_key), design.rule
+    fused, counted = add_sighting(voxel_map, seen.sighting, seen.window, params.fusion, rule, design.depth_range_m)
     if design.members:
         assert params.ensemble is not None
-        rule, depth_range_m, shape = design.rule, design.depth_range_m, design.window_shape
-        camera, draws = params.camera, params.ensemble
-        own = fuse_members(voxel_map, frame, seen.labels, camera, draws, frame_key, rule, depth_range_m, shape)
+        depth_range_m, shape, labels = design.depth_range_m, design.window_shape, seen.sighting.labels
+        own = fuse_members(
+            voxel_map, frame, labels, params.camera, params.ensemble, frame_key, rule, depth_range_m, shape
+        )
         fused = replace(fused, members=own)
-    if voxel_map.surface is not None and seen.heights is not None:
-        fused = replace(fused, surface=add_heights(voxel_map, seen.heights, seen.window))
-    return fused, seen.report
+    return fused, report_of(seen, counted)
 
 
 @in_full_float32
 def see_frame(
     design: StepDesign, grid: GridSpec, frame: Frame, params: MapperParams, frame_key: PRNGKeyArray
-) -> FrameEvidence:
-    """What a frame says of the voxels of a grid that it can see: all of the step but the sum."""
+) -> SeenFrame:
+    """What a frame shows of a grid: all of the step but the sum over voxels."""
     labeller, rule, depth_range_m = design.labeller, design.rule, design.depth_range_m
     camera, pose, fusion = params.camera, frame.T_world_camera, params.fusion
 
@@ -140,37 +134,22 @@ def see_frame(
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
     labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
-    free = None
-    if rule.carve:
-        free = carve(camera, pose, cloud.depth_m, cloud.valid, window, fusion, depth_range_m)
     weights = point_weights(grid, cloud, rule)
-    counts = count_points(window, cloud.points_world, labels, weights, len(labeller.classes))
+    height_sigma_m = height_sigma(cloud, pose.translation()[2]) if rule.surface else None
+    sighting = Sighting(camera, pose, cloud.points_world, labels, weights, height_sigma_m, cloud.depth_m, cloud.valid)
+    return SeenFrame(sighting, window, cloud.in_range.sum(), estimate)
 
-    heights = None
-    if rule.surface:
-        sigma_m = height_sigma(cloud, pose.translation()[2])
-        heights = gather_heights(window, cloud.points_world, sigma_m, labels.keep)
 
-    hits, freed = _count_voxels(total_weight(counts) > 0, free)
-    report = StepReport(
-        points_valid=cloud.valid.sum(),
-        points_in_range=cloud.in_range.sum(),
-        points_kept=labels.keep.sum(),
-        voxels_hit=hits,
-        voxels_freed=freed,
-        estimate=estimate,
+def report_of(seen: SeenFrame, counted: Counted) -> StepReport:
+    """What the step says of a frame."""
+    return StepReport(
+        points_valid=seen.sighting.valid.sum(),
+        points_in_range=seen.in_range,
+        points_kept=seen.sighting.labels.keep.sum(),
+        voxels_hit=counted.hits,
+        voxels_freed=counted.freed,
+        estimate=seen.estimate,
     )
-    return FrameEvidence(frame_evidence(counts, free, fusion, rule), window, labels, report, heights)
-
-
-def _count_voxels(
-    hits: Bool[Array, "X Y Z"], free: Bool[Array, "X Y Z"] | None
-) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """How many voxels hold points, and how many others were seen through."""
-    freed = jnp.zeros_like(hits) if free is None else free & ~hits
-    # Both in one sum, the second above 16 bits, and first along the short axis: thrice as fast as two sums.
-    both = (hits.astype(jnp.int32) + (freed.astype(jnp.int32) << 16)).sum(axis=2)
-    return (both & 0xFFFF).sum(), (both >> 16).sum()
 
 
 @in_full_float32
