@@ -17,8 +17,10 @@ from jaxtyping import Array, Float
 
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.convolutions import max_pool
+from jaxmap.models.fused import apply_fused
 from jaxmap.models.layers import ConvBlock, SeparableBlock, apply_by_bands
 from jaxmap.models.unpooling import Places, pool_with_places
+from jaxmap.native.build import has_kernel
 
 
 class Stage(NamedTuple):
@@ -168,12 +170,16 @@ class InvertedResidual(nnx.Module):
 
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the unit."""
+        return apply_fused(self, images)
+
+    def plain(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
+        """The same without the compiled kernel."""
         if self.is_large(images.shape):
             result = apply_by_bands(self.blocks, images)
         else:
             result = images
             for block in self.blocks:
-                result = block(result)
+                result = block.plain(result)
         return images + result if self.shortcut else result
 
     @property
@@ -226,7 +232,8 @@ class InvertedResidualNet(nnx.Module):
         first, second = self.units[0], self.units[1]
         done, follow = 0, _Halving(self.record)
         size = [self.stem.axis(length).outputs for length in images.shape[1:3]]
-        if follow.finest > 2 and not follow.pools and second.is_large((images.shape[0], *size, 0)):
+        large = second.is_large((images.shape[0], *size, 0)) and not has_kernel()
+        if follow.finest > 2 and not follow.pools and large:
             images = apply_by_bands([self.stem, *first.blocks, *second.blocks], images)
             done, follow.stride = 2, 4
         else:

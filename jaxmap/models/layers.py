@@ -19,6 +19,7 @@ from jaxmap.models.architecture import Activation, Norm, Padding
 from jaxmap.models.bands import by_bands, rows_per_band
 from jaxmap.models.batch_norm import BatchNorm, activate, add_bias
 from jaxmap.models.convolutions import WINOGRAD_MIN_CHANNELS, Axis, convolve_along, convolve_winograd
+from jaxmap.models.fused import apply_fused
 
 BATCH_NORM_MOMENTUM = 0.9
 """Weight of the old running statistics; 0.1 in torch, which gives that of the new ones."""
@@ -60,8 +61,19 @@ class ConvBlock(nnx.Module):
             else None
         )
 
+    shortcut = False
+
+    @property
+    def blocks(self) -> list[ConvBlock]:
+        """Itself."""
+        return [self]
+
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the block."""
+        return self.plain(images) if self.depthwise else apply_fused(self, images)
+
+    def plain(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
+        """The same without the compiled kernel."""
         kernel = self.kernel[...]
         if kernel.shape[0] != self.size:
             return self.finish(convolve_winograd(images, kernel, self.dilation))
@@ -146,7 +158,7 @@ def _by_bands_forward(graph: Any, state: Any, images: Array) -> tuple[Array, tup
 def _by_bands_backward(graph: Any, residuals: tuple[Any, Array], cotangent: Array) -> tuple[Any, Array]:
     def at_once(state: Any, images: Array) -> Array:
         for block in nnx.merge(graph, state):
-            images = block(images)
+            images = block.plain(images)
         return images
 
     return jax.vjp(at_once, *residuals)[1](cotangent)
@@ -197,6 +209,17 @@ class SeparableBlock(nnx.Module):
         )
         self.pointwise = ConvBlock(inputs, outputs, norm=norm, eps=eps, activation=activation)
 
+    shortcut = False
+
+    @property
+    def blocks(self) -> list[ConvBlock]:
+        """Its convolutions in their order."""
+        return [self.depthwise, self.pointwise]
+
     def __call__(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
         """Applies the block."""
-        return self.pointwise(self.depthwise(images))
+        return apply_fused(self, images)
+
+    def plain(self, images: Float[Array, "B H W I"]) -> Float[Array, "B h w O"]:
+        """The same without the compiled kernel."""
+        return self.pointwise.plain(self.depthwise.plain(images))
