@@ -1,6 +1,6 @@
 """What one frame adds to a map: its labelled points counted in voxels and columns, and the space that it saw through.
 
-`add_sighting` is the sum itself. On CPUs a kernel in C++ does it in one pass (`fused`), where it could be built; what
+`add_sighting` is the sum itself. On CPUs a kernel in C++ does it in one pass (`kernel`), where it could be built; what
 it computes is said here, in JAX: by `evidence_of`, added to the map.
 """
 
@@ -106,7 +106,7 @@ def add_plainly(
     rule: FusionRule,
     depth_range_m: tuple[float, float],
 ) -> tuple[VoxelMap, Counted]:
-    """`fused.add_sighting` in JAX alone, which it equals to within rounding."""
+    """`kernel.add_sighting` in JAX alone, which it equals to within rounding."""
     evidence = evidence_of(sighting, window, params, rule, depth_range_m)
     return add_evidence_of(voxel_map, evidence, window), evidence.counted
 

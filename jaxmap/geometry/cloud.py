@@ -58,7 +58,7 @@ def project(
     in_range = valid & (depth_m >= depth_range_m[0]) & (depth_m <= depth_range_m[1])
     points_world = transform_points(T_world_camera, points_camera)
     columns = [points_world[..., axis].reshape(-1) for axis in range(3)]
-    # Kept apart: each reader would compute the points anew, one by one. By columns, which readers then take as they are.
+    # Kept apart: each reader would compute the points anew, one by one. In columns, for readers of columns.
     columns, depth_m, in_range = jax.lax.optimization_barrier((columns, depth_m, in_range))
     points_world = jnp.stack(columns, axis=-1)
     relief = None

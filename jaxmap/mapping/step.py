@@ -17,7 +17,7 @@ from jaxmap.ensemble.draws import EnsembleParams
 from jaxmap.ensemble.members import fuse_members
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.frame import Counted, Sighting
-from jaxmap.fusion.fused import add_sighting
+from jaxmap.fusion.kernel import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.sensor_model import point_weights
@@ -26,7 +26,7 @@ from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
 from jaxmap.labels import IGNORE
-from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_voxel_map
+from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

@@ -476,7 +476,7 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, bool carve, int32_t* counte
   Workspace::give_back(std::move(work));
 }
 
-ffi::Error FuseFrame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi::Buffer<ffi::F32> surface,
+ffi::Error fuse_frame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi::Buffer<ffi::F32> surface,
                      ffi::Buffer<ffi::F32> numbers, ffi::Buffer<ffi::S32> places, ffi::Buffer<ffi::F32> x,
                      ffi::Buffer<ffi::F32> y, ffi::Buffer<ffi::F32> z, ffi::Buffer<ffi::PRED> keep,
                      ffi::Buffer<ffi::S32> labels, ffi::Buffer<ffi::F32> weights, ffi::Buffer<ffi::F32> height_weights,
@@ -524,7 +524,7 @@ ffi::Error FuseFrame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi::
 
 }  // namespace
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxmapFuseFrame, FuseFrame,
+XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxmap_fuse, fuse_frame,
                               ffi::Ffi::Bind()
                                   .Ctx<ffi::ThreadPool>()
                                   .Arg<ffi::Buffer<ffi::F32>>()   // log_odds

@@ -1,21 +1,20 @@
 """A frame into a map by one kernel in C++ (`native/fuse.cpp`): what `frame.add_plainly` does, in one pass.
 
-The plain form is made of whole windows: each step reads and writes all their voxels, of which a frame touches a few
-in a hundred, and XLA scatters points one by one on one core. The kernel touches what the frame touches, in place. Sums over
-the points of a voxel are rounded in another order; all else is the same. Gradients, and devices other than CPUs, take
-the plain form.
+The plain form is made of whole windows: each step of it reads and writes all their voxels, of which a frame touches a
+few in a hundred, and XLA scatters points one by one on one core. The kernel touches what the frame touches, in place.
+Sums over the points of a voxel are rounded in another order; all else is the same. Where there is no compiler, for
+gradients, and on other devices than CPUs, the plain form does it.
 """
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxmap.fusion.carve import MARGIN_SIGMAS
 from jaxmap.fusion.frame import Counted, Sighting, add_plainly
@@ -23,22 +22,10 @@ from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.surface import POSE_SIGMA_M
 from jaxmap.geometry.camera import depth_sigma
+from jaxmap.native.build import FUSE_TARGET, has_kernel
 from jaxmap.types import GridSpec, VoxelMap
 
 _RULES = ("sum", "once", "majority", "mean")
-_TARGET = "jaxmap_fuse_frame"
-
-
-@cache
-def _loaded() -> bool:
-    import ctypes
-
-    path = os.environ.get("FUSE_SO", "/tmp/fuse.so")
-    if path == "none":
-        return False
-    library = ctypes.cdll.LoadLibrary(path)
-    jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(library.JaxmapFuseFrame), platform="cpu")
-    return True
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(4, 5))
@@ -61,15 +48,33 @@ def add_sighting(
         depth_range_m: voxels nearer or farther are not seen through.
     """
     plain = partial(add_plainly, rule=rule, depth_range_m=depth_range_m)
-    if not _loaded():
+    if not has_kernel(FUSE_TARGET):
         return plain(voxel_map, sighting, window, params)
     kernel = partial(_by_kernel, rule=rule, depth_range_m=depth_range_m)
     return jax.lax.platform_dependent(voxel_map, sighting, window, params, cpu=kernel, default=plain)
 
 
-@add_sighting.defjvp
-def _add_sighting_jvp(rule, depth_range_m, primals, tangents):
-    return jax.jvp(partial(add_plainly, rule=rule, depth_range_m=depth_range_m), primals, tangents)
+def _differentiated(
+    rule: FusionRule, depth_range_m: tuple[float, float], primals: PyTree, tangents: PyTree
+) -> tuple[PyTree, PyTree]:
+    """Derivatives of the plain form, in what changes alone: of all else not even zeros are made."""
+    leaves, form = jax.tree.flatten(primals)
+    changes = jax.tree.leaves(tangents, is_leaf=_is_zero)
+    moving = [index for index, change in enumerate(changes) if not _is_zero(change)]
+
+    def plain(*moved: Array) -> tuple[VoxelMap, Counted]:
+        those = dict(zip(moving, moved, strict=True))
+        arguments = [those.get(index, leaf) for index, leaf in enumerate(leaves)]
+        return add_plainly(*jax.tree.unflatten(form, arguments), rule, depth_range_m)
+
+    return jax.jvp(plain, [leaves[index] for index in moving], [changes[index] for index in moving])
+
+
+def _is_zero(change: object) -> bool:
+    return isinstance(change, jax.custom_derivatives.SymbolicZero)
+
+
+add_sighting.defjvp(_differentiated, symbolic_zeros=True)
 
 
 def _by_kernel(
@@ -80,7 +85,7 @@ def _by_kernel(
     rule: FusionRule,
     depth_range_m: tuple[float, float],
 ) -> tuple[VoxelMap, Counted]:
-    labels, points = sighting.labels, len(sighting.weights)
+    labels, weights = sighting.labels, sighting.weights
     log_odds, surface = voxel_map.log_odds, voxel_map.surface
     height_weights = jnp.zeros(0)
     if surface is None:
@@ -88,34 +93,33 @@ def _by_kernel(
     elif sighting.height_sigma_m is not None:
         sigma_m = sighting.height_sigma_m
         height_weights = jnp.where(jnp.isfinite(sigma_m), 1.0 / (sigma_m**2 + POSE_SIGMA_M**2), 0.0)
-    hard = jnp.zeros(0, jnp.int32) if labels.labels is None else labels.labels.astype(jnp.int32)
-    soft = () if labels.probabilities is None else [labels.probabilities[:, index] for index in range(len(voxel_map.classes))]
-    flat = tuple(jax.ShapeDtypeStruct(like.shape, like.dtype) for like in (log_odds, surface))
+    # Column by column, as XLA has them before it stacks them: nothing is copied.
+    columns = [sighting.points_world[:, axis] for axis in range(3)]
+    hard, shares = jnp.zeros(0, jnp.int32), []
+    if labels.probabilities is not None:
+        shares = [labels.probabilities[:, index] for index in range(len(voxel_map.classes))]
+    elif labels.labels is not None:
+        hard = labels.labels.astype(jnp.int32)
+    places = jnp.concatenate([window.first, window.first - voxel_map.grid.first]).astype(jnp.int32)
     call = jax.ffi.ffi_call(
-        _TARGET,
-        (*flat, jax.ShapeDtypeStruct((2,), jnp.int32)),
+        FUSE_TARGET,
+        (
+            jax.ShapeDtypeStruct(log_odds.shape, log_odds.dtype),
+            jax.ShapeDtypeStruct(surface.shape, surface.dtype),
+            jax.ShapeDtypeStruct((2,), jnp.int32),
+        ),
         input_output_aliases={0: 0, 1: 1},
         vmap_method="sequential",
     )
     with jax.named_scope("fuse"):
         new_log_odds, new_surface, counted = call(
-            log_odds,
-            surface,
-            _numbers(sighting, window, params, depth_range_m),
-            jnp.concatenate([window.first, window.first - voxel_map.grid.first]).astype(jnp.int32),
-            # Column by column, as XLA has them before it stacks them: nothing is copied.
-            *(sighting.points_world[:, axis] for axis in range(3)),
-            labels.keep,
-            hard,
-            sighting.weights,
-            height_weights,
-            jnp.where(sighting.valid, sighting.depth_m, 0.0),
-            *soft,
+            *(log_odds, surface, _numbers(sighting, window, params, depth_range_m), places),
+            *(*columns, labels.keep, hard, weights, height_weights),
+            *(jnp.where(sighting.valid, sighting.depth_m, 0.0), *shares),
             shape=np.asarray(window.shape, np.int64),
             carve=rule.carve,
             rule=np.int64(_RULES.index(rule.per_frame)),
         )
-    assert points == sighting.depth_m.size
     fused = replace(
         voxel_map,
         log_odds=new_log_odds,
