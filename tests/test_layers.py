@@ -14,7 +14,7 @@ FLOORS = (
     # the host's files, threads, memory and settings
     "host",
     # pure geometry
-    "geometry localisation",
+    "geometry localisation native",
     "models stereo fusion profiling",
     # what labels points, what doubts a map, what reads logs
     "labellers ensemble datasets",
