@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 STAGES = (
     *("project", "transform", "relief", "mlesac", "plane_labels", "network", "pixel_labels"),
-    *("view_window", "carve", "count_points", "frame_evidence", "add_evidence", "fuse_members"),
+    *("view_window", "fuse", "carve", "count_points", "frame_evidence", "add_evidence", "fuse_members"),
 )
 """The named scopes of the step, in its order."""
 

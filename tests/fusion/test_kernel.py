@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import CLASSES, poses, rngs
 
@@ -32,8 +32,7 @@ CAMERA = make_stereo_camera(fx_px=60, cx_px=39.2, cy_px=30.7, baseline_m=0.2, wi
 DEPTHS_M = (0.3, 5.0)
 GRID = make_grid([-4.1, -4.1, -2.9], [4.3, 4.2, 3.1], (0.15, 0.2, 0.3))
 RULES = [
-    FusionRule(rule, carve=carve)
-    for rule, carve in (("sum", False), ("once", True), ("majority", True), ("mean", True))
+    *(FusionRule("sum", carve=False), FusionRule("once"), FusionRule("majority"), FusionRule("mean", carve=False)),
 ]
 MEAN = FusionRule()
 
@@ -71,9 +70,21 @@ def maps_equal(one: VoxelMap, other: VoxelMap, *, most_freed: int = 2) -> None:
 
 
 @needs_kernel
+@settings(max_examples=10)
+@given(poses(reach_m=1.0), rngs())
+def test_the_kernel_equals_the_plain_form(pose, rng):
+    compare(sighting_of(pose, rng, soft=True, heights=True), MEAN)
+
+
+@needs_kernel
+@pytest.mark.slow
 @given(poses(reach_m=1.0), rngs(), st.sampled_from(RULES), st.booleans())
-def test_the_kernel_equals_the_plain_form(pose, rng, rule, soft):
-    sighting = sighting_of(pose, rng, soft=soft and not rule.hard_labels, heights=True)
+def test_the_kernel_equals_the_plain_form_under_every_rule(pose, rng, rule, soft):
+    compare(sighting_of(pose, rng, soft=soft and not rule.hard_labels, heights=True), rule)
+
+
+def compare(sighting: Sighting, rule: FusionRule) -> None:
+    """Fuses a frame twice, in both forms."""
     params, before = make_fusion_params(CLASSES), make_voxel_map(GRID, CLASSES, surface=True)
     for _ in range(2):
         expected, count = plainly(before, sighting, GRID, params, rule, DEPTHS_M)
@@ -85,6 +96,7 @@ def test_the_kernel_equals_the_plain_form(pose, rng, rule, soft):
 
 
 @needs_kernel
+@pytest.mark.slow
 @pytest.mark.parametrize("classes", [(), CLASSES[:1], tuple(f"class {n}" for n in range(9))], ids=len)
 @pytest.mark.parametrize("soft", [False, True])
 def test_the_kernel_takes_any_number_of_classes(classes, soft):
@@ -95,6 +107,7 @@ def test_the_kernel_takes_any_number_of_classes(classes, soft):
 
 
 @needs_kernel
+@settings(max_examples=10)
 @given(poses(reach_m=1.0), rngs(), st.booleans())
 def test_through_any_window_the_kernel_adds_the_same_bits(pose, rng, soft):
     sighting = sighting_of(pose, rng, soft=soft, heights=True)
@@ -116,6 +129,7 @@ def test_through_any_window_the_kernel_adds_the_same_bits(pose, rng, soft):
 
 
 @needs_kernel
+@pytest.mark.slow
 def test_points_that_are_no_place_or_weigh_nothing_finite_change_no_bit_of_the_evidence():
     rng, pose = np.random.default_rng(4), jaxlie.SE3.identity()
     sighting = sighting_of(pose, rng, soft=True, heights=False)
@@ -138,6 +152,7 @@ def test_points_that_are_no_place_or_weigh_nothing_finite_change_no_bit_of_the_e
 
 
 @needs_kernel
+@pytest.mark.slow
 def test_gradients_are_those_of_the_plain_form():
     sighting = sighting_of(jaxlie.SE3.identity(), np.random.default_rng(5), soft=True, heights=True)
     empty, weighing = make_voxel_map(GRID, CLASSES, surface=True), jnp.sin(jnp.arange(4.0))[:, None, None, None]
@@ -155,6 +170,7 @@ def test_gradients_are_those_of_the_plain_form():
 
 
 @needs_kernel
+@pytest.mark.slow
 def test_several_maps_at_once_are_each_their_own():
     rng = np.random.default_rng(6)
     sighting = sighting_of(jaxlie.SE3.identity(), rng, soft=True, heights=False)
@@ -186,16 +202,11 @@ def fused_hash() -> str:
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not bind processes to cores")
 def test_on_one_core_the_map_has_the_same_bits():
-    program = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); import test_kernel; print(test_kernel.fused_hash())"
-    folder = os.path.dirname(__file__)
-    path = os.pathsep.join([folder, os.path.dirname(folder), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )
+    bind = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])"
+    command = [sys.executable, "-c", f"{bind}; import test_kernel; print(test_kernel.fused_hash())"]
+    folders = (os.path.dirname(__file__), os.path.dirname(os.path.dirname(__file__)), os.environ.get("PYTHONPATH", ""))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split()[-1] == fused_hash()
 
 
