@@ -48,7 +48,8 @@ def add_sighting(
         depth_range_m: voxels nearer or farther are not seen through.
     """
     plain = partial(add_plainly, rule=rule, depth_range_m=depth_range_m)
-    if not has_kernel(FUSE_TARGET):
+    # The kernel knows float32 alone.
+    if jax.config.jax_enable_x64 or not has_kernel(FUSE_TARGET):  # pyright: ignore[reportAttributeAccessIssue]
         return plain(voxel_map, sighting, window, params)
     kernel = partial(_by_kernel, rule=rule, depth_range_m=depth_range_m)
     return jax.lax.platform_dependent(voxel_map, sighting, window, params, cpu=kernel, default=plain)
