@@ -13,7 +13,7 @@ FLOORS = (
     "errors types labels",
     # the host's files, threads, memory and settings
     "host",
-    # pure geometry
+    # pure geometry; what is compiled from C++
     "geometry localisation native",
     "models stereo fusion profiling",
     # what labels points, what doubts a map, what reads logs

@@ -167,7 +167,7 @@ struct Tile {
 };
 
 // What becomes of the sums of a tile, pixel by pixel.
-void finish_tile(const Tile& tile, const Vector* sums, int pixels, int vectors) {
+__attribute__((noinline)) void finish_tile(const Tile& tile, const Vector* sums, int pixels, int vectors) {
   for (int pixel = 0; pixel < pixels; ++pixel) {
     float* result = tile.result + pixel * tile.result_stride;
     for (int vector = 0; vector < vectors; ++vector, ++sums) {
@@ -206,17 +206,21 @@ void multiply_tile(const Tile& tile) {
   finish_tile(tile, kept, kPixels, kVectors);
 }
 
+template <int kPixels, int kVectors>
+void multiply_few(const Tile& tile, int64_t count) {
+  if constexpr (kPixels > 0) {
+    count == kPixels ? multiply_tile<kPixels, kVectors>(tile) : multiply_few<kPixels - 1, kVectors>(tile, count);
+  }
+}
+
 template <int kVectors>
 void multiply_panel(Tile tile, int64_t count) {
   constexpr int kPixels = pixels_beside(kVectors);
-  const Tile start = tile;
-  for (int64_t pixel = 0; pixel < count;) {
-    const bool several = count - pixel >= kPixels;
-    tile.pixels = start.pixels + pixel * tile.pixel_stride;
-    tile.result = start.result + pixel * tile.result_stride;
-    if (start.shortcut) tile.shortcut = start.shortcut + pixel * tile.result_stride;
-    several ? multiply_tile<kPixels, kVectors>(tile) : multiply_tile<1, kVectors>(tile);
-    pixel += several ? kPixels : 1;
+  for (; count > 0; count -= kPixels) {
+    multiply_few<kPixels, kVectors>(tile, std::min<int64_t>(count, kPixels));
+    tile.pixels += kPixels * tile.pixel_stride;
+    tile.result += kPixels * tile.result_stride;
+    if (tile.shortcut) tile.shortcut += kPixels * tile.result_stride;
   }
 }
 
@@ -268,49 +272,67 @@ struct Depthwise {
   Range range;
 };
 
-// Sums of neighbouring outputs that are held in registers.
-constexpr int kNeighbours = 8;
+// An element of the kernel, and the pixel that it meets; both are the first of their channels.
+struct Tap {
+  const float *weights, *pixel;
+};
 
-// Outputs `place` and on of one vector of channels; all but a lone one see only pixels of the image.
-template <int kOutputs>
-inline void slide(const Depthwise& layer, const Window& window, const float* const* rows, int64_t width, int64_t place,
-                  int64_t channel, float* result) {
-  const int64_t left = layer.channels - channel, step = window.stride * layer.channels;
+// Neighbouring outputs of a vector of channels, from the elements that meet the image at all of them.
+template <int kOutputs, bool kWhole>
+inline void sum_taps(const Depthwise& layer, const Tap* taps, int count, int64_t step, int64_t channel, float* result) {
+  const int64_t some = kWhole ? kLanes : layer.channels - channel;
   Vector sums[kOutputs];
-  const Vector bias = load_some(layer.bias + channel, left);
+  const Vector bias = load_some(layer.bias + channel, some);
   for (int output = 0; output < kOutputs; ++output) sums[output] = bias;
-  const int64_t begin = place * window.stride - window.before_columns;
-  for (int64_t row = 0; row < window.size; ++row) {
-    if (!rows[row]) continue;
-    for (int64_t column = 0; column < window.size; ++column) {
-      const int64_t pixel = begin + column * window.dilation;
-      if (kOutputs == 1 && (pixel < 0 || pixel >= width)) continue;
-      const float* from = rows[row] + pixel * layer.channels + channel;
-      const Vector weight = load_some(layer.kernel + (row * window.size + column) * layer.channels + channel, left);
-      for (int output = 0; output < kOutputs; ++output) sums[output] += weight * load_some(from + output * step, left);
-    }
+  for (int tap = 0; tap < count; ++tap) {
+    const Vector weight = load_some(taps[tap].weights + channel, some);
+    const float* pixel = taps[tap].pixel + channel;
+    for (int output = 0; output < kOutputs; ++output, pixel += step) sums[output] += weight * load_some(pixel, some);
   }
   for (int output = 0; output < kOutputs; ++output) {
-    store_some(result + (place + output) * layer.channels + channel, layer.range(sums[output]), left);
+    store_some(result + output * layer.channels + channel, layer.range(sums[output]), some);
   }
 }
 
-// One row of the result, a few vectors of channels at a time, whose weights stay in the innermost cache.
+template <int kOutputs>
+void sum_channels(const Depthwise& layer, const Tap* taps, int count, int64_t step, int64_t first, int64_t end,
+                  float* result) {
+  int64_t channel = first;
+  for (; channel + kLanes <= end; channel += kLanes) sum_taps<kOutputs, true>(layer, taps, count, step, channel, result);
+  if (channel < end) sum_taps<kOutputs, false>(layer, taps, count, step, channel, result);
+}
+
+// One row of the result.
 void slide_row(const Depthwise& layer, const Window& window, const float* const* rows, int64_t width, int64_t outputs,
                float* result) {
-  const int64_t inside = std::min(outputs, (window.before_columns + window.stride - 1) / window.stride);
-  const int64_t reach = width - 1 + window.before_columns - (window.size - 1) * window.dilation;
-  const int64_t end = reach < 0 ? 0 : std::min(outputs, reach / window.stride + 1);
-  constexpr int64_t kTogether = 4 * kLanes;
-  for (int64_t first = 0; first < layer.channels; first += kTogether) {
-    const int64_t last = std::min(first + kTogether, layer.channels);
-    for (int64_t place = 0; place < outputs;) {
-      const bool several = place >= inside && place + kNeighbours <= end;
-      for (int64_t channel = first; channel < last; channel += kLanes) {
-        several ? slide<kNeighbours>(layer, window, rows, width, place, channel, result)
-                : slide<1>(layer, window, rows, width, place, channel, result);
+  constexpr int64_t kNeighbours = 8, kChannels = 8 * kLanes;
+  const int64_t channels = layer.channels;
+  Tap taps[kLargestWindow * kLargestWindow];
+  const auto taps_at = [&](int64_t place) {
+    int count = 0;
+    for (int64_t row = 0; row < window.size; ++row) {
+      for (int64_t column = 0; column < window.size; ++column) {
+        const int64_t pixel = place * window.stride - window.before_columns + column * window.dilation;
+        if (!rows[row] || pixel < 0 || pixel >= width) continue;
+        taps[count++] = {layer.kernel + (row * window.size + column) * channels, rows[row] + pixel * channels};
       }
-      place += several ? kNeighbours : 1;
+    }
+    return count;
+  };
+  // Outputs from `begin` to `end` see nothing but pixels of the image, several of them the same elements.
+  const int64_t reach = width - 1 + window.before_columns - (window.size - 1) * window.dilation;
+  const int64_t begin = std::min(outputs, (window.before_columns + window.stride - 1) / window.stride);
+  int64_t end = reach < 0 ? begin : std::max(begin, std::min(outputs, reach / window.stride + 1));
+  end -= (end - begin) % kNeighbours;
+  for (int64_t place = 0; place < outputs; ++place) {
+    if (place >= begin && place < end) continue;
+    sum_channels<1>(layer, taps, taps_at(place), 0, 0, channels, result + place * channels);
+  }
+  // A few channels at a time, whose weights stay in the innermost cache.
+  for (int64_t first = 0; first < channels; first += kChannels) {
+    for (int64_t place = begin; place < end; place += kNeighbours) {
+      sum_channels<kNeighbours>(layer, taps, taps_at(place), window.stride * channels, first,
+                                std::min(first + kChannels, channels), result + place * channels);
     }
   }
 }
@@ -349,7 +371,7 @@ struct Block {
 };
 
 // Pixels that are projected together.
-constexpr int64_t kTogether = 64;
+constexpr int64_t kTogether = 96;
 
 // Rows `first` to `end` of the result of one image.
 void rows_of_block(const Block& block, const float* image, float* result, int64_t first, int64_t end) {
@@ -370,7 +392,7 @@ void rows_of_block(const Block& block, const float* image, float* result, int64_
     }
     return hidden + row % ring * row_floats;
   };
-  const int64_t group = std::max<int64_t>(1, kTogether / out.width), row_inputs = out.width * block.project.inputs;
+  const int64_t group = (kTogether + out.width - 1) / out.width, row_inputs = out.width * block.project.inputs;
   float* windows = kept_windows.floats(group * row_inputs);
   const float* rows[kLargestWindow];
   for (int64_t begin = first; begin < end; begin += group) {
@@ -410,7 +432,7 @@ void run(ffi::ThreadPool& pool, Block block, const float* images, float* results
   const Sizes &size = block.images, &out = block.results;
   const int64_t threads = std::max<int64_t>(1, pool.num_threads());
   if (block.window.size == 1 && block.window.stride == 1 && !block.depthwise.kernel) {
-    const int64_t pixels = out.batch * out.height * out.width, together = 2 * kTogether;
+    const int64_t pixels = out.batch * out.height * out.width, together = kTogether;
     parallel(pool, (pixels + together - 1) / together, [&](int64_t index) {
       const int64_t first = index * together, count = std::min(together, pixels - first);
       const float* shortcut = block.shortcut ? images + first * size.channels : nullptr;

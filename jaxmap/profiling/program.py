@@ -12,6 +12,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from jaxmap.native.build import TARGET
+
 STAGES = (
     *("project", "transform", "relief", "mlesac", "plane_labels", "network", "pixel_labels"),
     *("view_window", "fuse", "carve", "count_points", "frame_evidence", "add_evidence", "fuse_members"),
@@ -158,6 +160,10 @@ def _flops(one: _Instruction, by_name: Mapping[str, _Instruction]) -> float:
         features = re.search(r"dim_labels=\w+_(\w+)->", one.text)
         outputs = operands[1].shape[features.group(1).index("o")] if features else 1
         return 2.0 * one.elements * operands[1].elements / max(outputs, 1)
+    if f'custom_call_target="{TARGET}"' in one.text:
+        images, expand, _, depthwise, _, project, _ = operands
+        pixels, outputs = math.prod(images.shape[:3]), math.prod(one.shape[:3])
+        return 2.0 * (pixels * expand.elements + outputs * (depthwise.elements + project.elements))
     if one.opcode in ("reduce", "reduce-window"):
         return float(operands[0].elements) if operands else 0.0
     if one.opcode == "scatter":

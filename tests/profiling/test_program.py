@@ -6,7 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
+from jaxmap.models.architecture import folded, torch_architecture
+from jaxmap.models.backbones import InvertedResidual
+from jaxmap.native.build import has_kernel
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program, stage_of
 
 SCOPES = ("first", "second")
@@ -101,3 +105,19 @@ def test_names_of_arrays_are_no_scopes():
     assert {one.stage for one in program.values()} == {OTHER}
     assert OTHER not in STAGES
     assert np.isfinite([one.flops for one in program.values()]).all()
+
+
+def test_the_compiled_kernel_is_counted_by_hand():
+    if not has_kernel():
+        pytest.skip("no C++ compiler, or no CPU")
+    unit = InvertedResidual(4, 8, 3, 2, 1, folded(torch_architecture("mobilenet_v2", ("one", "two"))))
+    nnx.update(unit, jax.tree.map(jnp.ones_like, nnx.state(unit)))
+
+    def apply(images):
+        with jax.named_scope("first"):
+            return unit(images)
+
+    flops, moved = total(operations(apply, jnp.ones((2, 16, 12, 4))), "first")
+    expand, depthwise, project = 2 * 16 * 12 * 4 * 12, 2 * 8 * 6 * 12 * 9, 2 * 8 * 6 * 12 * 8
+    assert flops == 2 * (expand + depthwise + project)
+    assert moved == 4 * (2 * 16 * 12 * 4 + 2 * 8 * 6 * 8 + (4 * 12 + 12) + (9 * 12 + 12) + (12 * 8 + 8))
