@@ -20,6 +20,7 @@ from jaxmap.datasets.bit_depth import BitDepth, to_8_bits, used_bits
 from jaxmap.datasets.options import Bits
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.pictures import open_picture, oriented, raw_mode, size_of, turn_of
+from jaxmap.host.png import plain_png
 from jaxmap.models.tensor_files import shortened
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
@@ -235,15 +236,17 @@ def read_pixels(path: Path, *, as_shown: bool = False, size_px: tuple[int, int] 
 
 
 def _decoded(image: ImageFile.ImageFile, path: Path) -> np.ndarray:
+    if (pixels := plain_png(image, path)) is not None:
+        return pixels
     if has_deep_colours(image):
         return decode_deep(image, path)
     image.load()
     if image.mode in _DEEP_GREY_MODES:
         return np.array(image)
-    if image.mode in _GREY_MODES:
-        return np.array(image.convert("L"))
-    if image.mode in _COLOUR_MODES:
-        return np.array(image.convert("RGB"))
+    for wanted, modes in (("L", _GREY_MODES), ("RGB", _COLOUR_MODES)):
+        if image.mode in modes:
+            # Pillow copies what it need not convert.
+            return np.array(image if image.mode == wanted else image.convert(wanted))
     raise ValueError(f"pixels of type {image.mode}")
 
 

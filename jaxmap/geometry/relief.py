@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jaxmap.geometry.camera import depth_sigma, disparity_to_points
 from jaxmap.geometry.ground import Lattice, LevelPoints, fit_ground, fit_plane, mean_cells, safe_sqrt
@@ -134,6 +134,12 @@ def relief_channels(relief: Relief) -> Float[Array, "h w 6"]:
         jnp.ones_like(known),
     )
     return jnp.stack([channel * known for channel in channels], axis=-1)
+
+
+def to_pixels(image: Shaped[Array, "h w *c"], image_px: tuple[int, int]) -> Shaped[Array, "H W *c"]:
+    """An image of relief at the pixels of the disparity, whose height and width are given."""
+    fine = jnp.repeat(jnp.repeat(image, RELIEF_STRIDE, axis=0), RELIEF_STRIDE, axis=1)
+    return fine[: image_px[0], : image_px[1]]
 
 
 def level_rotation(up_camera: Float[Array, "3"]) -> Float[Array, "3 3"]:

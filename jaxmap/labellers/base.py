@@ -14,6 +14,7 @@ from jaxmap.fusion.bijectors import Bijector
 from jaxmap.fusion.options import FusionRule
 from jaxmap.geometry.cloud import PointCloud
 from jaxmap.geometry.options import GroundOptions
+from jaxmap.geometry.relief import to_pixels
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, PointLabels
 
@@ -31,16 +32,20 @@ Pointwise = Callable[[Float[Array, "N D *w"]], tuple[Shaped[Array, "N *w"], ...]
 class FeatureMap(Protocol):
     """`PointFeatures.map`."""
 
-    def __call__(self, function: Pointwise, more: Float[Array, "N E"] | None = None) -> tuple[Shaped[Array, "N"], ...]:
+    def __call__(
+        self, function: Pointwise, more: Float[Array, "h w E"] | None = None
+    ) -> tuple[Shaped[Array, "N"], ...]:
         """Applies the function."""
         ...
 
 
-def dense_features(values: Shaped[Array, "N D"]) -> FeatureMap:
-    """The map of features that are held as an array."""
+def dense_features(values: Shaped[Array, "N D"], image_px: tuple[int, int]) -> FeatureMap:
+    """The map of features that are held as an array, of the pixels of an image (height, width)."""
 
-    def map_dense(function: Pointwise, more: Float[Array, "N E"] | None = None) -> tuple[Array, ...]:
-        return function(values if more is None else jnp.concatenate([values, more], axis=1))
+    def map_dense(function: Pointwise, more: Float[Array, "h w E"] | None = None) -> tuple[Array, ...]:
+        if more is None:
+            return function(values)
+        return function(jnp.concatenate([values, to_pixels(more, image_px).reshape(len(values), -1)], axis=1))
 
     return map_dense
 
@@ -51,7 +56,8 @@ class PointFeatures(NamedTuple):
     Attributes:
         keep: points to fuse.
         map: applies a pointwise function to the features and gives its arrays (N,). The features need never be held
-            all at once. Further features (N, E), where they are given, follow the labeller's own.
+            all at once. Further features, where they are given, follow the labeller's own: an image (h, w, E) of
+            relief, whose pixels are `RELIEF_STRIDE` of the frame's wide.
         of_frame: a pytree of the whole frame.
     """
 
@@ -157,7 +163,7 @@ def make_no_labeller() -> Labeller:
     """Geometry alone: no class at all."""
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
-        return PointFeatures(cloud.in_range.reshape(-1), dense_features(cloud.points_world))
+        return PointFeatures(cloud.in_range.reshape(-1), dense_features(cloud.points_world, cloud.depth_m.shape))
 
     def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array]:
         return (jnp.full(values.shape[:1], IGNORE, jnp.int32),)

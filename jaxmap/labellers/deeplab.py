@@ -18,7 +18,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.fusion.bijectors import positive
 from jaxmap.geometry.cloud import PointCloud
 from jaxmap.geometry.options import GroundOptions
-from jaxmap.geometry.relief import relief_channels
+from jaxmap.geometry.relief import RELIEF_STRIDE, relief_channels
 from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, Pointwise
 from jaxmap.labellers.options import DeeplabOptions
 from jaxmap.labellers.relief import floating_points, ground_seen
@@ -161,9 +161,8 @@ def make_logits_labeller(
         places = upsampling(architecture, coarse.shape[:2], image_px, options.size_px)
 
         def map_rows(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
-            more = more if more is None else more.reshape(*image_px, -1)
             with jax.named_scope("pixel_labels"):
-                return tuple(image.reshape(-1) for image in map_pixels(function, coarse, places, more))
+                return tuple(image.reshape(-1) for image in map_pixels(function, coarse, places, more, RELIEF_STRIDE))
 
         return PointFeatures(keep, map_rows, of_frame)
 

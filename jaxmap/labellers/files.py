@@ -20,7 +20,7 @@ def make_files_labeller(classes: Sequence[str], *, soft: bool) -> Labeller:
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
         carried = getattr(frame, needs)
         values = carried.reshape(carried.shape[0] * carried.shape[1], -1)
-        return PointFeatures(cloud.in_range.reshape(-1), dense_features(values))
+        return PointFeatures(cloud.in_range.reshape(-1), dense_features(values, carried.shape[:2]))
 
     def label(values: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
         return tuple(values[:, c] for c in range(len(classes))) if soft else (values[:, 0].astype(jnp.int32),)

@@ -48,7 +48,7 @@ def make_plane_labeller(classes: Sequence[str], options: PlaneOptions | None = N
         points, keep = cloud.points_world, cloud.in_range.reshape(-1)
         with jax.named_scope("mlesac"):
             start = search_plane(key, points, keep, up_world, params.numbers["sigma_m"], options)
-        return PointFeatures(keep, dense_features(points), start)
+        return PointFeatures(keep, dense_features(points, cloud.depth_m.shape), start)
 
     def estimate(start: PlaneStart, numbers: Numbers) -> Plane:
         with jax.named_scope("mlesac"):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.bijectors import Bijector, between, positive
 from jaxmap.geometry.cloud import PointCloud
-from jaxmap.geometry.relief import RELIEF_STRIDE, box_sums
+from jaxmap.geometry.relief import box_sums, to_pixels
 from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, Pointwise
 from jaxmap.labellers.options import ReliefOptions
 from jaxmap.labels import IGNORE
@@ -77,7 +77,7 @@ def make_relief_labeller(classes: Sequence[str], options: ReliefOptions | None =
         def map_coarse(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
             assert more is None
             return tuple(
-                _to_pixels(image.reshape(-1, width), shape).reshape(-1)
+                to_pixels(image.reshape(-1, width), shape).reshape(-1)
                 for image in function(values.reshape(-1, _FEATURES))
             )
 
@@ -124,10 +124,10 @@ def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
         inner = labeller.features(frame, cloud, params, key)
-        relief = _to_pixels(_coarse_features(cloud), cloud.depth_m.shape).reshape(-1, _FEATURES)
+        relief = _coarse_features(cloud)
 
         def map_both(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
-            return inner.map(function, relief if more is None else jnp.concatenate([relief, more], axis=1))
+            return inner.map(function, relief if more is None else jnp.concatenate([relief, more], axis=-1))
 
         return PointFeatures(inner.keep & ~floating_points(cloud), map_both, ground_seen(cloud, inner.of_frame))
 
@@ -185,7 +185,7 @@ def rock_log_odds(values: Float[Array, "N 4 *w"], numbers: Numbers) -> Float[Arr
 def floating_points(cloud: PointCloud) -> Bool[Array, "N"]:
     """Points that are false matches in the air."""
     assert cloud.relief is not None
-    return _to_pixels(cloud.relief.floating, cloud.depth_m.shape).reshape(-1)
+    return to_pixels(cloud.relief.floating, cloud.depth_m.shape).reshape(-1)
 
 
 def ground_seen(cloud: PointCloud, own: PyTree = ()) -> GroundSeen:
@@ -202,12 +202,6 @@ def _coarse_features(cloud: PointCloud) -> Float[Array, "h w 4"]:
     mass = box_sums(known)
     height_m = box_sums(relief.height_m * known) / jnp.maximum(mass, 1.0)
     return jnp.stack([height_m, relief.sigma_m, jnp.arctan(relief.slope), known], axis=-1)
-
-
-def _to_pixels(coarse: Array, shape: tuple[int, ...]) -> Array:
-    """An image of relief at the pixels of the disparity."""
-    fine = jnp.repeat(jnp.repeat(coarse, RELIEF_STRIDE, axis=0), RELIEF_STRIDE, axis=1)
-    return fine[: shape[0], : shape[1]]
 
 
 def _indices(classes: Sequence[str], options: ReliefOptions, names: tuple[str, ...]) -> list[int]:

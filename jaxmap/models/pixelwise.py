@@ -81,7 +81,8 @@ def map_pixels(
     function: Callable[[Float[Array, "R C W"]], tuple[Array, ...]],
     coarse: Float[Array, "h w C"],
     places: Upsampling,
-    more: Float[Array, "H W E"] | None = None,
+    more: Float[Array, "h2 w2 E"] | None = None,
+    stride: int = 1,
 ) -> tuple[Array, ...]:
     """Applies a function to the logits at all pixels, a few rows at a time.
 
@@ -89,7 +90,8 @@ def map_pixels(
         function: from the logits of R rows to images (R, W); it must treat pixels alike.
         coarse: the coarse logits.
         places: where the pixels lie among them.
-        more: further numbers of each pixel, which follow the logits.
+        more: further numbers of each pixel, which follow the logits: an image whose pixels are `stride` pixels wide.
+        stride: a power of two, 16 at most.
 
     Returns:
         The images (H, W) that the function gives.
@@ -111,14 +113,16 @@ def map_pixels(
         ]
         logits = jnp.concatenate(parts, axis=-1)[..., :width]
         if beside is not None:
+            # Only here, where they stay in the cache, they come to as many as the pixels.
+            beside = jnp.repeat(jnp.repeat(beside, stride, axis=0), stride, axis=2)[..., :width]
             logits = jnp.concatenate([logits, beside], axis=1)
         # Without the barrier they would be computed anew for each use.
         return function(jax.lax.optimization_barrier(logits))
 
     if more is not None:
-        missing = len(rows.starts) * _BLOCK_ROWS - height
+        missing = len(rows.starts) * (_BLOCK_ROWS // stride) - len(more)
         more = jnp.swapaxes(jnp.pad(more, ((0, missing), (0, 0), (0, 0))), 1, 2)
-        more = more.reshape(-1, _BLOCK_ROWS, *more.shape[1:])
+        more = more.reshape(-1, _BLOCK_ROWS // stride, *more.shape[1:])
     images = jax.lax.map(block, (jnp.asarray(rows.starts), jnp.asarray(rows.weights), more))
     return tuple(image.reshape(-1, width)[:height] for image in images)
 

@@ -231,20 +231,22 @@ def write_key_frame(
 
     Large ones are PNG of the image's own size, others small WebP.
     """
+    import cv2
     from PIL import Image
 
     pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
+    # Noise does not compress: more effort takes twice to four times as long and saves little.
+    ending, effort = ("png", dict(compress_level=1)) if large else ("webp", dict(quality=80, method=2))
     for kind, picture in pictures.items():
-        image, ending = Image.fromarray(picture), "png"
-        effort: dict[str, Any] = dict(compress_level=1)
-        if not large:
-            image.thumbnail((_SMALL_PX, _SMALL_PX))
-            ending, effort = "webp", dict(quality=80)
+        height, width = picture.shape[:2]
+        shrink = _SMALL_PX / max(height, width)
+        if not large and shrink < 1:
+            size = max(round(shrink * width), 1), max(round(shrink * height), 1)
+            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         with atomic_path(folder.pictures / f"{index:06d}_{kind}.{ending}") as temporary:
-            # Noise does not compress: more effort takes four times as long and saves little.
-            image.save(temporary, **effort)
+            Image.fromarray(picture).save(temporary, **effort)
 
 
 def count_voxels(reader: MapReader, params: FusionParams, rule: FusionRule) -> dict[str, Any]:

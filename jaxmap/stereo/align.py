@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float64
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from jaxmap.stereo.match import as_grey
 from jaxmap.types import StereoCamera
 
 FEATURES = 1500
@@ -66,7 +67,7 @@ def match_features(left: np.ndarray, right: np.ndarray, shrink: int = 1) -> Floa
 
 def shrunk_grey(image: np.ndarray, shrink: int) -> np.ndarray:
     """An image, grey or RGB, as grey and shrunk so many times; what is left of a whole pixel at its edges goes."""
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    grey = as_grey(image)
     if shrink == 1:
         return grey
     height, width = (length // shrink * shrink for length in grey.shape)

@@ -14,7 +14,7 @@ from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.align import alignment_homography, estimate_alignment, match_features
 from jaxmap.stereo.blank import blank_reason
-from jaxmap.stereo.match import Matcher, StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions, as_grey
 from jaxmap.stereo.near import NearGuard
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
 from jaxmap.types import StereoCamera
@@ -47,6 +47,8 @@ class StereoFrontEnd:
         rectified_here: whether the images are raw, and rectified by it.
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
         alignment_rad: rotation vector by which the rectified right camera is corrected, or None.
+        matcher: of the rectified images.
+        near_guard: finds what is too near for the matcher, or None where that was not asked for.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class StereoFrontEnd:
         self.rectified_here = self.rectifier is not None
         self.camera: StereoCamera = camera
         self.matcher = Matcher(options, camera.width_px)
-        self._near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
+        self.near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> RectifiedFrame:
         """Rectifies and matches one pair.
@@ -95,10 +97,11 @@ class StereoFrontEnd:
                     raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
             left, right = self.rectify(left, right)
         with timed_stage("match", stages_s):
-            disparity_px = self.matcher(left, right)
+            both_grey = as_grey(left), as_grey(right)
+            disparity_px = self.matcher(*both_grey)
             if self.rectifier is not None:
                 disparity_px[~self.rectifier.seen] = np.nan
-            near = None if self._near_guard is None else self._near_guard(left, right)
+            near = None if self.near_guard is None else self.near_guard(*both_grey)
             if near is not None:
                 disparity_px[near.pixels] = np.nan
         times_s = stages_s["rectify"], stages_s["match"]

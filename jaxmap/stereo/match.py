@@ -12,7 +12,6 @@ from jaxmap.errors import FrameError, UsageError
 from jaxmap.host.settings import NotNegative, count, options
 
 _SUBPIXELS = 16
-_FAR_PX = np.float32(1e6)
 _MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
 """OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
@@ -122,27 +121,27 @@ class Matcher:
         if left.shape[:2] != right.shape[:2]:
             sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
             raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
-        left, right = _grey(left), _grey(right)
-        image_px = left.size
+        left, right = as_grey(left), as_grey(right)
         pad = max(self.num_disparities + self.options.min_disparity_px, 0) if self.options.pad_left else 0
-        left, right = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
-        raw = self._engine(image_px).compute(left, right)[:, pad:]
-        disparity_px = np.multiply(raw, np.float32(1 / _SUBPIXELS), dtype=np.float32)
-        np.copyto(disparity_px, np.nan, where=raw < self.options.min_disparity_px * _SUBPIXELS)
-        return self._without_edges(disparity_px)
+        padded = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
+        found = self.engine(left.size).compute(*padded)[:, pad:]
+        # Counted from the least that is searched; OpenCV's own mark of the unknown is less than all.
+        sixteenths = found - np.int16(self.options.min_disparity_px * _SUBPIXELS)
+        disparity_px = np.multiply(found, np.float32(1 / _SUBPIXELS), dtype=np.float32)
+        np.copyto(disparity_px, np.nan, where=(sixteenths < 0) | self._at_edges(sixteenths))
+        return disparity_px
 
-    def _without_edges(self, disparity_px: np.ndarray) -> np.ndarray:
-        """The same without pixels near a step of disparity."""
+    def _at_edges(self, sixteenths: np.ndarray) -> np.ndarray:
+        """Where a step of disparity is near; means nothing where disparity is unknown, which is negative."""
         import cv2
 
         if not self.options.edge_step_px:
-            return disparity_px
+            return np.zeros(sixteenths.shape, bool)
         square = np.ones((self.options.edge_window_px,) * 2, np.uint8)
-        unknown = np.isnan(disparity_px)
-        least = cv2.erode(np.where(unknown, _FAR_PX, disparity_px), square)
-        greatest = cv2.dilate(np.where(unknown, -_FAR_PX, disparity_px), square)
-        disparity_px[greatest - least > self.options.edge_step_px] = np.nan
-        return disparity_px
+        greatest = cv2.dilate(sixteenths, square)
+        # Without their sign, negative numbers are greater than all others.
+        least = cv2.erode(sixteenths.view(np.uint16), square).view(np.int16)
+        return cv2.subtract(greatest, least) > self.options.edge_step_px * _SUBPIXELS
 
     def looks_swapped(self, left: np.ndarray, right: np.ndarray, disparity_px: np.ndarray) -> bool:
         """Whether the pair matches far better with left and right exchanged."""
@@ -153,11 +152,11 @@ class Matcher:
         other_way = np.isfinite(self(right, left)).mean()
         return bool(other_way > 0.2 and other_way > 1.4 * valid)
 
-    def _engine(self, image_px: int) -> Any:
+    def engine(self, image_px: int) -> Any:
+        """OpenCV's matcher of grey images of so many pixels; each thread has its own, which reuses its buffers."""
         # Imported here, so that the command line can read the options without OpenCV.
         import cv2
 
-        # An engine reuses its buffers, so each thread has its own.
         if not hasattr(self._local, "engine"):
             options, unchecked = self.options, self.options.left_right_max_diff_px < 0
             p1, p2 = options.penalties()
@@ -182,7 +181,8 @@ class Matcher:
         return self._local.engine
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
+def as_grey(image: np.ndarray) -> np.ndarray:
+    """An image, grey or RGB, as grey (ITU-R 601 luma)."""
     import cv2
 
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -251,13 +251,18 @@ def test_a_network_sees_the_relief_of_the_frame_in_the_step():
     assert mapper.compilations() == 1
 
 
-def test_further_numbers_of_pixels_follow_the_logits():
+@pytest.mark.parametrize(("image_px", "stride"), [((24, 32), 1), ((24, 32), 4), ((22, 29), 4)])
+def test_further_numbers_of_pixels_follow_the_logits(image_px, stride):
     rng = np.random.default_rng(2)
-    coarse, more = (jnp.asarray(rng.normal(size=size), jnp.float32) for size in ((6, 8, 3), (24, 32, 2)))
-    places = upsampling(SMALL, (6, 8), (24, 32), None)
+    more_px = [-(-length // stride) for length in image_px]
+    coarse, more = (jnp.asarray(rng.normal(size=size), jnp.float32) for size in ((6, 8, 3), (*more_px, 2)))
+    places = upsampling(SMALL, (6, 8), image_px, None)
     alone = map_pixels(lambda logits: (logits[:, 0], logits[:, 2]), coarse, places)
-    both = map_pixels(lambda values: (values[:, 0], values[:, 2], values[:, 3], values[:, 4]), coarse, places, more)
-    for one, other in zip((*alone, more[..., 0], more[..., 1]), both, strict=True):
+    both = map_pixels(
+        lambda values: (values[:, 0], values[:, 2], values[:, 3], values[:, 4]), coarse, places, more, stride
+    )
+    fine = np.kron(more, np.ones((stride, stride, 1)))[: image_px[0], : image_px[1]]
+    for one, other in zip((*alone, fine[..., 0], fine[..., 1]), both, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
