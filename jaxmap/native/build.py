@@ -45,7 +45,7 @@ def has_kernel(target: str = TARGET) -> bool:
 @cache
 def _registered(target: str) -> bool:
     try:
-        library = _load(_compiled(Path(__file__).with_name(_SOURCES[target])))
+        library = _load(_compiled(target))
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
     except (OSError, subprocess.SubprocessError) as error:
         reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines() or [type(error).__name__]
@@ -58,14 +58,14 @@ def _registered(target: str) -> bool:
     return True
 
 
-def _compiled(source: Path) -> Path:
+def _compiled(target: str = TARGET) -> Path:
     """The library for this processor; made if it is not there yet.
 
     Raises:
         OSError: there is no compiler, or the cache folder cannot be written to.
         subprocess.SubprocessError: the compiler fails.
     """
-    asked = os.environ.get("CXX")
+    asked, source = os.environ.get("CXX"), Path(__file__).with_name(_SOURCES[target])
     compiler = next(filter(None, map(shutil.which, (asked,) if asked else _COMPILERS)), None)
     if compiler is None:
         raise OSError(f"no C++ compiler ({asked or ', '.join(_COMPILERS)}) on PATH")
