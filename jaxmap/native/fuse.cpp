@@ -25,7 +25,8 @@ namespace ffi = xla::ffi;
 namespace {
 
 constexpr int32_t kNowhere = std::numeric_limits<int32_t>::min();  // the place of a point that does not count
-constexpr int64_t kBlock = 2048;                                   // points, or voxels, that are worked on together
+constexpr int64_t kBlock = 2048;                                   // points that are worked on together
+constexpr int64_t kVoxels = 256;                                   // voxels that are
 constexpr int kMostThreads = 8;                                    // that add runs: each looks at all of them
 constexpr float kLeastWeight = 1e-12f;
 
@@ -367,8 +368,8 @@ Range columns_in_view(const Frame& frame, int64_t plane) {
   return {int64_t(begin), std::max(int64_t(begin), int64_t(end))};
 }
 
-// Marks down the voxels of one plane of the window that the camera saw through; returns how many. Three loops for each
-// block, because compilers vectorise what comes before and after a look-up, but not all of them the look-up itself.
+// Marks down the voxels of one plane of the window that the camera saw through; returns how many. Loops of their own
+// before and after the look-up: compilers vectorise those, but not all of them the look-up itself.
 int32_t carve_plane(const Frame& frame, int64_t plane, const float* y_of, const float* z_of, const int32_t* slots) {
   const Numbers n = frame.numbers;
   const float *R = n.rotation, *t = n.translation, *depths = frame.measured;
@@ -380,11 +381,11 @@ int32_t carve_plane(const Frame& frame, int64_t plane, const float* y_of, const 
   // Where the window is as high as the map, columns follow each other in both, and all are one row.
   const bool one_row = depth == frame.map_shape[2];
   const int64_t row_columns = one_row ? std::max<int64_t>(columns.end - columns.begin, 1) : 1;
-  float distance[kBlock], measured[kBlock];
-  int32_t pixel[kBlock], freed = 0;
+  float distance[kVoxels], measured[kVoxels];
+  int32_t pixel[kVoxels], seen_through[kVoxels], freed = 0;
   for (int64_t column = columns.begin; column < columns.end; column += row_columns) {
-    for (int64_t start = 0; start < row_columns * depth; start += kBlock) {
-      const int32_t voxels = int32_t(std::min(kBlock, row_columns * depth - start));
+    for (int64_t start = 0; start < row_columns * depth; start += kVoxels) {
+      const int32_t voxels = int32_t(std::min(kVoxels, row_columns * depth - start));
       const float *y_here = y_of + column * depth + start, *z_here = z_of + column * depth + start;
       for (int32_t j = 0; j < voxels; ++j) {
         const float y = y_here[j], z = z_here[j];
@@ -400,11 +401,18 @@ int32_t carve_plane(const Frame& frame, int64_t plane, const float* y_of, const 
         distance[j] = in_view & in_range ? z_camera : INFINITY;
       }
       for (int32_t j = 0; j < voxels; ++j) measured[j] = depths[pixel[j]];
+      int32_t any = 0;
+      for (int32_t j = 0; j < voxels; ++j) {
+        const float margin = n.margin + measured[j] * measured[j] * n.sigma;
+        seen_through[j] = distance[j] + margin < measured[j] ? 1 : 0;
+        any += seen_through[j];
+      }
+      // Where nothing is free the map is not even looked at.
+      if (any == 0) continue;
       float* __restrict cell = frame.log_odds + frame.cell(plane, column, 0) + start;
       const int32_t* slot = slots + (plane * frame.shape[1] + column) * depth + start;
       for (int32_t j = 0; j < voxels; ++j) {
-        const float margin = n.margin + measured[j] * measured[j] * n.sigma;
-        const bool free = (distance[j] + margin < measured[j]) & (slot[j] == 0);
+        const bool free = (seen_through[j] != 0) & (slot[j] == 0);
         cell[j] += free ? miss : 0.0f;
         freed += free ? 1 : 0;
       }
