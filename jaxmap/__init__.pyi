@@ -32,8 +32,9 @@ from .models.importers import import_weights
 from .models.network import PureNetwork, fold_batch_norm, make_network, pure_form, pure_network
 from .runs.segmentation import Segmenter
 from .stereo.front_end import StereoFrontEnd
+from .stereo.jax_matcher import JaxMatcher
 from .stereo.match import StereoOptions
-from .stereo.rectify import make_stereo_rig
+from .stereo.rectify import make_raw_pair, make_stereo_rig
 from .tuning.pull_back import make_pull_back, map_gradient
 from .types import (
     Frame,
@@ -63,6 +64,7 @@ __all__ = [
     "FusionRule",
     "GridSpec",
     "GroundOptions",
+    "JaxMatcher",
     "JaxmapError",
     "Labeller",
     "LabellerParams",
@@ -111,6 +113,7 @@ __all__ = [
     "make_no_labeller",
     "make_plane_labeller",
     "make_pull_back",
+    "make_raw_pair",
     "make_relief_labeller",
     "make_stereo_camera",
     "make_stereo_rig",

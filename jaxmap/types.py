@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ import jaxlie
 import numpy as np
 import numpy.typing as npt
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8
 
 from jaxmap.errors import JaxmapError
 
@@ -30,6 +30,10 @@ MOST_VOXELS_ALONG = 2**23
 MOST_CAMERA_PX, MOST_BASELINE_M = 1e6, 1e4
 """Focal lengths and principal points, and baselines, beyond these are mistakes; float32 must hold their products."""
 _LEAST = 1e-6
+
+
+DistortionModel = Literal["opencv", "equidistant"]
+"""How a lens bends rays: OpenCV's usual model, or that of a fisheye."""
 
 
 def _static() -> dict[str, bool]:
@@ -124,19 +128,34 @@ def pinhole(camera: StereoCamera) -> Pinhole:
 class Frame:
     """One stereo frame, ready for the compiled step.
 
-    `disparity_px` is NaN where the matcher found nothing; `image` is the rectified left one, grey or RGB; `logits`
-    are what a network has made of it, at its own resolution. One of the next four is present where the labeller asks
-    for it, so that every frame of a sequence has the same structure; `pose_errors` are those of the members of an
-    ensemble, where there is one (`ensemble.draws.draw_pose_errors`).
+    `disparity_px` is NaN where the matcher found nothing; it is None where the step itself matches `image` with
+    `right_image`, but for the pixels that are `blind`: those have no disparity, whatever the images show. `image` is
+    the rectified left one, grey or RGB; `logits` are what a network has made of it, at its own resolution. One of
+    `image`, `labels`, `class_probabilities` and `logits` is present where the labeller asks for it, so that every frame
+    of a sequence has the same structure; `pose_errors` are those of the members of an ensemble, where there is one
+    (`ensemble.draws.draw_pose_errors`).
     """
 
-    disparity_px: Float[Array, "H W"]
+    disparity_px: Float[Array, "H W"] | None
     T_world_camera: jaxlie.SE3
-    image: UInt8[Array, "H W *rgb"] | None = None
+    image: Shaped[Array, "H W *rgb"] | None = None
     labels: UInt8[Array, "H W"] | None = None
     class_probabilities: Float[Array, "H W C"] | None = None
     logits: Float[Array, "h w C"] | None = None
     pose_errors: Float[Array, "M 6"] | None = None
+    right_image: Shaped[Array, "H W *rgb"] | None = None
+    blind: Bool[Array, "H W"] | None = None
+
+    @property
+    def matched_px(self) -> Float[Array, "H W"]:
+        """The disparity that the frame brings.
+
+        Raises:
+            JaxmapError: it brings none; its images were to be matched within the step.
+        """
+        if self.disparity_px is None:
+            raise JaxmapError("the frame has no disparity", where="Frame", fix="match its images first")
+        return self.disparity_px
 
 
 @jax.tree_util.register_dataclass
@@ -211,6 +230,15 @@ def make_grid(
     )
 
 
+LAYER = 16
+"""Voxels of the lattice, in height, whose points share the statistics of a column: those of a tile."""
+
+
+def layer_count(height: int) -> int:
+    """How many layers so many voxels of height touch at most, wherever on the lattice they begin."""
+    return (height + LAYER - 2) // LAYER + 1
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class VoxelMap:
@@ -219,7 +247,7 @@ class VoxelMap:
     Channel 0 is occupancy, channel `1 + c` is class `c`. A voxel that nothing has touched holds
     exact zeros; priors are added when the map is read (`fusion.query`), so that maps can be summed.
     `members` are those of an ensemble (`ensemble.members`), two channels each, where there is one; `surface` are the
-    heights of each column (`fusion.surface`), where they are kept.
+    heights of each column, in layers of `LAYER` voxels of the lattice (`fusion.surface`), where they are kept.
     """
 
     log_odds: Float[Array, "K X Y Z"]
@@ -227,7 +255,7 @@ class VoxelMap:
     grid: GridSpec
     classes: tuple[str, ...] = field(metadata=_static())
     members: Float[Array, "M 2 X Y Z"] | None = None
-    surface: Float[Array, "4 X Y"] | None = None
+    surface: Float[Array, "4 X Y L"] | None = None
 
 
 def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0, *, surface: bool = False) -> VoxelMap:
@@ -249,7 +277,7 @@ def make_voxel_map(grid: GridSpec, classes: Sequence[str], members: int = 0, *, 
         grid=grid,
         classes=tuple(classes),
         members=jnp.zeros((members, 2, *grid.shape), jnp.float32) if members else None,
-        surface=jnp.zeros((4, *grid.shape[:2]), jnp.float32) if surface else None,
+        surface=jnp.zeros((4, *grid.shape[:2], layer_count(grid.shape[2])), jnp.float32) if surface else None,
     )
 
 

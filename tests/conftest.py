@@ -26,6 +26,9 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
+# Made-up observations are shared with the benchmarks; at the end, that names of the tests go first.
+sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts" / "benchmarks"))
+
 # `types`, `fusion.params` and `models.network` stay out: JAX rebuilds their dataclasses with stacked arrays,
 # placeholders for leaves, and shapes without arrays.
 FUSION_MODULES = ("fusion.carve", "fusion.integrate", "fusion.query", "fusion.sensor_model", "fusion.splat")

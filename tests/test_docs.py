@@ -103,6 +103,7 @@ PRINTED = {
     "README.md": r"motorcycle_left \d+ voxels hit\n\(120, 120\)",
     "docs/architecture.md": r"kitti.*my_rover",
     "docs/fusion_and_tuning.md": r"0\.\d+, d loss / d occupancy_hit 0\.\d+",
+    "docs/matching.md": r"\d{3,} points in \d+ voxels",
     "docs/networks.md": r"\{'sand': .*, 'rock': .*\}\n$",
     "docs/large_maps.md": r"\d+ voxels observed in \d+ blocks of \(2, 2, 2\)",
     "docs/outputs.md": r"\('sand',\) \(2, 2, 2, 2\) None",

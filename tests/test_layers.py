@@ -15,7 +15,10 @@ FLOORS = (
     "host",
     # pure geometry; what is compiled from C++
     "geometry localisation native",
-    "models stereo fusion profiling",
+    "models fusion profiling",
+    # stereo matching in JAX, and the host's front end, which offers it beside OpenCV's
+    "matching",
+    "stereo",
     # what labels points, what doubts a map, what reads logs
     "labellers ensemble datasets",
     # the compiled step, what feeds it, and the map on disk

@@ -98,6 +98,7 @@ def test_every_import_of_the_tests_is_declared():
     # packaging comes with pytest; folders of the tests and scripts are local; only tests/golden wants the peers of the
     # benchmarks.
     local = {folder.name for part in ("tests", "scripts") for folder in (ROOT / part).iterdir() if folder.is_dir()}
+    local |= {file.stem.replace("_", "-") for file in (ROOT / "scripts" / "benchmarks").glob("*.py")}
     declared = DEPENDENCIES.keys() | EXTRAS["test"].keys() | EXTRAS["bench"].keys() | {"packaging"} | local
     missing = {name: path for name, path in third_party_imports(ROOT / "tests").items() if name not in declared}
     assert not missing, f"add to the test extra in pyproject.toml: {missing}"

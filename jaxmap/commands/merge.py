@@ -11,7 +11,10 @@ import tyro
 from jaxmap.commands.console import Console, parse
 from jaxmap.errors import UsageError
 
-OUTPUTS = ("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json", "config.yaml", "poses.tum")
+OUTPUTS = (
+    *("report.html", "map.zarr", "map.ply", "bev.tif", "bev.png", "metrics.json"),
+    *("config.yaml", "poses.tum", "frames.csv"),
+)
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,8 @@ class MergeArguments:
     """Run folders, as jaxmap map has written them."""
     out: Path
     """The run folder to write; none of those that are merged."""
+    rover: str = "katwijk"
+    """YAML file of the rover whose hazards are layers of the map, or the name of one in configs/rovers (katwijk)."""
     overwrite: bool = False
     """Replace a run that lies in the folder; it stays until the new one is whole."""
 
@@ -36,13 +41,14 @@ def main(words: Sequence[str]) -> int:
 
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.host.files import real_path
+    from jaxmap.planning.options import ROVER_SETTINGS
     from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.merging import merge_sessions, open_sessions, settings_of
 
     if real_path(arguments.out) in map(real_path, arguments.runs):
         raise UsageError("a run to be merged would be replaced", where=arguments.out, fix="choose another --out")
     keep_compiled_programs()
-    console = Console()
+    console, rover = Console(), ROVER_SETTINGS.load(arguments.rover)
     sessions = open_sessions(arguments.runs)
     folder, blocks = RunFolder(arguments.out), sum(len(session.reader.places) for session in sessions)
     with (
@@ -50,7 +56,7 @@ def main(words: Sequence[str]) -> int:
         folder.writing(settings_of(sessions), resume=None, overwrite=arguments.overwrite) as work,
         console.steps("merging", "blocks", blocks) as advance,
     ):
-        notes = merge_sessions(sessions, work, advance)
+        notes = merge_sessions(sessions, work, rover, advance)
     for note in notes:
         console.notify(f"note: {note}")
     console.notify(

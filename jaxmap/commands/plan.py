@@ -40,17 +40,18 @@ def main(words: Sequence[str]) -> int:
     import numpy as np
 
     from jaxmap.host.cache import keep_compiled_programs
+    from jaxmap.planning.options import ROVER_SETTINGS
     from jaxmap.runs.folder import RunFolder
-    from jaxmap.runs.planning import PLAN_FILES, ROVER_SETTINGS, plan_path, read_costs, write_plan
+    from jaxmap.runs.planning import PLAN_FILES, plan_path, read_costs, write_plan
 
     keep_compiled_programs()
     console, out = Console(), arguments.out or arguments.run
     rover = ROVER_SETTINGS.load(arguments.rover)
     RunFolder(arguments.run).settle_for_reading()
     costs = read_costs(arguments.run, rover)
-    if costs.rock is None:
+    if costs.site.rock is None:
         console.notify("note: the map has no class of rocks: the path keeps clear of hazards by height alone")
-    if costs.voxel_map.surface is None:
+    if not costs.site.fine:
         console.notify("note: the map has no surface heights, only voxels: hazards are coarse; map again to have them")
     plan = plan_path(costs, np.array(arguments.start), np.array(arguments.goal))
     write_plan(costs, plan, out)

@@ -15,8 +15,8 @@ from jaxmap.datasets.matlab import is_matlab
 from jaxmap.datasets.text_files import image_size, load_yaml, number, number_list
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import atomic_path
-from jaxmap.stereo.rectify import DistortionModel, StereoRig, make_stereo_rig
-from jaxmap.types import StereoCamera, make_stereo_camera
+from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
+from jaxmap.types import DistortionModel, StereoCamera, make_stereo_camera
 
 _RECTIFIED_KEYS = ("image_size_px", "fx_px", "cx_px", "cy_px", "baseline_m")
 _RECTIFIED_OPTIONAL = ("fy_px", "doffs_px", "mounting")

@@ -13,7 +13,8 @@ from jaxtyping import Float64
 from jaxmap.datasets.calibration import pinhole_matrix
 from jaxmap.datasets.text_files import image_size, number_list
 from jaxmap.errors import JaxmapError
-from jaxmap.stereo.rectify import DistortionModel, StereoRig, make_stereo_rig
+from jaxmap.stereo.rectify import StereoRig, make_stereo_rig
+from jaxmap.types import DistortionModel
 
 _MODELS: dict[str, DistortionModel] = {
     **dict.fromkeys(("radtan", "radial-tangential", "plumb_bob"), "opencv"),

@@ -66,8 +66,8 @@ def fuse_members(
 
     def evidence_of(number: Array, sensor: MemberParams, pose_error: Array) -> tuple[Array, Array]:
         """What a frame adds to one member, and where its window of the grid starts."""
-        noise = disparity_noise(jax.random.fold_in(key, number), frame.disparity_px.shape, params.block_px)
-        disparity_px = frame.disparity_px + params.disparity_sigma_px * noise
+        noise = disparity_noise(jax.random.fold_in(key, number), frame.matched_px.shape, params.block_px)
+        disparity_px = frame.matched_px + params.disparity_sigma_px * noise
         pose, fusion = displaced(frame.T_world_camera, pose_error), sensor.fusion
 
         cloud = project(camera, pose, disparity_px, depth_range_m, fusion.disparity_sigma_px)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxmap.errors import JaxmapError
-from jaxmap.export.source import Columns, Source
+from jaxmap.export.source import Source, TopDownPart
 from jaxmap.host.files import atomic_path
 
 COST_LAYER = "cost"
@@ -68,7 +68,7 @@ def write_nav2(source: Source, map_yaml: Path, map_image: Path, costs_yaml: Path
             temporary.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def _costs(columns: Columns, target: int) -> Float[np.ndarray, "X Y"]:
+def _costs(columns: TopDownPart, target: int) -> Float[np.ndarray, "X Y"]:
     """Costs from 0 to 1, NaN where they are not known: `1 - 1 / cost` of the layer, or else the probability of rock."""
     layer = columns.layers.get(COST_LAYER)
     return np.asarray(columns.top.probability)[target] if layer is None else 1 - 1 / np.maximum(layer, 1)

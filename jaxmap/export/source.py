@@ -32,7 +32,7 @@ SURFACE = "surface_m"
 """The layer of a map that holds the height of the surface, more finely than the voxels."""
 
 
-class Columns(NamedTuple):
+class TopDownPart(NamedTuple):
     """A part of the top-down map.
 
     Attributes:
@@ -192,7 +192,7 @@ class Source:
                 centres, label, probability = (leaf[order] for leaf in voxels[1:4])
                 yield OccupiedVoxels(index[order], centres, label, probability, voxels.voxel_size_m)
 
-    def columns(self, margin: int = 0) -> Iterator[Columns]:
+    def columns(self, margin: int = 0) -> Iterator[TopDownPart]:
         """The top-down map, block by block, with as many columns around each as there are."""
         params, rule = self.fusion
         reach = kernel_margin(params.class_kernel)
@@ -205,9 +205,9 @@ class Source:
             x, y = (start - (side[0] - low) for start, side, low in zip(corner, sides, lows, strict=True))
             width, depth = top.observed.shape
             place = (slice(x, x + width), slice(y, y + depth))
-            layers = {name: values[place] for name, values in self.reader.attributes.layers.items()}
+            layers = self.reader.layers(place)
             inner = tuple(slice(low - a, high - a) for a, (low, high) in zip(lows, sides, strict=True))
-            yield Columns((x, y), top, layers, (inner[0], inner[1]))
+            yield TopDownPart((x, y), top, layers, (inner[0], inner[1]))
 
     def observed_box(self, most_cells: int, form: str) -> tuple[tuple[int, int], tuple[int, int]] | None:
         """Corner and size of the observed part of the top-down map, in columns; None where nothing was observed.
@@ -234,7 +234,7 @@ class Source:
             )
         return (x, y), (width, depth)
 
-    def whole(self, most_cells: int, form: str) -> Columns | None:
+    def whole(self, most_cells: int, form: str) -> TopDownPart | None:
         """The observed part of the top-down map as one, for forms that are one array; see `observed_box`."""
         box = self.observed_box(most_cells, form)
         if box is None:
@@ -250,7 +250,7 @@ class Source:
                 into[to] = values[x, y]
             for name, values in columns.layers.items():
                 layers[name][to] = values[x, y]
-        return Columns(corner, whole, layers, (slice(0, width), slice(0, depth)))
+        return TopDownPart(corner, whole, layers, (slice(0, width), slice(0, depth)))
 
     def nothing_observed(self, form: str) -> JaxmapError:
         """The error of a form that needs something."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxmap.export.source import SURFACE, Columns, Source
+from jaxmap.export.source import SURFACE, Source, TopDownPart
 
 _SIGMA, _REACH = 2.0, 6
 """Of the smoothing, in columns."""
@@ -43,7 +43,7 @@ def patches(source: Source) -> Iterator[Patch]:
             yield patch
 
 
-def _patch(source: Source, columns: Columns) -> Patch:
+def _patch(source: Source, columns: TopDownPart) -> Patch:
     observed = np.asarray(columns.top.observed)
     height_m = columns.height_m if SURFACE in columns.layers else _smooth(columns.height_m, observed, source.size_m[2])
     number = np.arange(observed.size).reshape(observed.shape)

@@ -57,12 +57,13 @@ class Evidence(NamedTuple):
     """What a frame says of the voxels of a window, and of its columns where heights are kept."""
 
     log_odds: Float[Array, "C1 X Y Z"]
-    heights: Float[Array, "4 X Y"] | None
+    heights: Float[Array, "4 X Y L"] | None
     counted: Counted
 
 
 def evidence_of(
     sighting: Sighting,
+    grid: GridSpec,
     window: GridSpec,
     params: FusionParams,
     rule: FusionRule,
@@ -72,7 +73,8 @@ def evidence_of(
 
     Args:
         sighting: the frame.
-        window: of a map.
+        grid: that of the map.
+        window: of it.
         params: the sensor model, whose matrix gives the number of classes.
         rule: how the points of a frame add up, and whether it carves.
         depth_range_m: voxels nearer or farther are not seen through.
@@ -85,7 +87,7 @@ def evidence_of(
     counts = count_points(window, points_world, labels, sighting.weights, params.class_increments.shape[0])
     heights = None
     if sighting.height_sigma_m is not None:
-        heights = gather_heights(window, points_world, sighting.height_sigma_m, labels.keep)
+        heights = gather_heights(grid, window, points_world, sighting.height_sigma_m, labels.keep)
     counted = _count_voxels(total_weight(counts) > 0, free)
     return Evidence(frame_evidence(counts, free, params, rule), heights, counted)
 
@@ -107,7 +109,7 @@ def add_plainly(
     depth_range_m: tuple[float, float],
 ) -> tuple[VoxelMap, Counted]:
     """`kernel.add_sighting` in JAX alone, which it equals to within rounding."""
-    evidence = evidence_of(sighting, window, params, rule, depth_range_m)
+    evidence = evidence_of(sighting, voxel_map.grid, window, params, rule, depth_range_m)
     return add_evidence_of(voxel_map, evidence, window), evidence.counted
 
 

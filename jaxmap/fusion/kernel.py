@@ -23,7 +23,7 @@ from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.surface import POSE_SIGMA_M
 from jaxmap.geometry.camera import depth_sigma
 from jaxmap.native.build import FUSE_TARGET, has_kernel
-from jaxmap.types import GridSpec, VoxelMap
+from jaxmap.types import LAYER, GridSpec, VoxelMap
 
 _RULES = ("sum", "once", "majority", "mean")
 
@@ -90,7 +90,7 @@ def _by_kernel(
     log_odds, surface = voxel_map.log_odds, voxel_map.surface
     height_weights = jnp.zeros(0)
     if surface is None:
-        surface = jnp.zeros((4, 0, 0))
+        surface = jnp.zeros((4, 0, 0, 0))
     elif sighting.height_sigma_m is not None:
         sigma_m = sighting.height_sigma_m
         height_weights = jnp.where(jnp.isfinite(sigma_m), 1.0 / (sigma_m**2 + POSE_SIGMA_M**2), 0.0)
@@ -118,6 +118,7 @@ def _by_kernel(
             *(*columns, labels.keep, hard, weights, height_weights),
             *(jnp.where(sighting.valid, sighting.depth_m, 0.0), *shares),
             shape=np.asarray(window.shape, np.int64),
+            layer=np.int64(LAYER),
             carve=rule.carve,
             rule=np.int64(_RULES.index(rule.per_frame)),
         )

@@ -108,7 +108,7 @@ def make_deeplab_labeller(
     behind = make_logits_labeller(saved.architecture, classes, options)
 
     def perceive(frame: Frame, cloud: PointCloud, params: LabellerParams) -> Float[Array, "h w C"]:
-        image, relief = _image(frame), None
+        image, relief = _image(frame, cloud), None
         if behind.ground is not None:
             assert cloud.relief is not None
             relief = relief_channels(cloud.relief)[None]
@@ -153,7 +153,7 @@ def make_logits_labeller(
     ]
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
-        coarse, image_px, keep = frame.logits, frame.disparity_px.shape, cloud.in_range.reshape(-1)
+        coarse, image_px, keep = frame.logits, cloud.valid.shape, cloud.in_range.reshape(-1)
         assert coarse is not None
         of_frame = ()
         if ground is not None:
@@ -188,7 +188,7 @@ def make_logits_labeller(
     )
 
 
-def _image(frame: Frame) -> UInt8[Array, "H W 3"]:
+def _image(frame: Frame, cloud: PointCloud) -> UInt8[Array, "H W 3"]:
     """The frame's image as RGB.
 
     Raises:
@@ -196,9 +196,9 @@ def _image(frame: Frame) -> UInt8[Array, "H W 3"]:
     """
     assert frame.image is not None
     image = frame.image if frame.image.ndim == 3 else jnp.repeat(frame.image[..., None], 3, axis=-1)
-    if image.shape != (*frame.disparity_px.shape, 3):
+    if image.shape != (*cloud.valid.shape, 3):
         raise JaxmapError(
-            f"the image is {tuple(frame.image.shape)}, the disparity {tuple(frame.disparity_px.shape)}",
+            f"the image is {tuple(frame.image.shape)}, the disparity {cloud.valid.shape}",
             where=_WHERE,
             fix="give the rectified left image, grey or RGB",
         )

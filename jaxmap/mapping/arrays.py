@@ -16,6 +16,7 @@ from jaxmap.errors import JaxmapError
 from jaxmap.host.files import check_regular
 from jaxmap.host.memory import available_bytes
 from jaxmap.mapping.attributes import FORMAT_VERSION, bad_attribute
+from jaxmap.types import LAYER
 
 if TYPE_CHECKING:
     import zarr
@@ -25,9 +26,14 @@ MEMBERS = "ensemble_log_odds"
 """The members of an ensemble: float32 (M, 2, X, Y, Z), occupancy and the class that is asked about."""
 
 SURFACE = "surface"
-"""Heights of the columns: float32 (4, X, Y), number of points, weight, mean height, and sum of squares about it."""
+"""Heights of the columns: float32 (4, X, Y, L), number of points, weight, mean height and sum of squares about it, of
+each layer of the lattice that is as high as a tile."""
+SURFACE_AXES = ("channel", "x", "y", "layer")
 
-TILE = (64, 64, 16)
+LAYER_AXES = ("x", "y")
+"""Of the layers of the top-down map."""
+
+TILE = (64, 64, LAYER)
 """Voxels along the edges of a tile, at most: a cube of 3.2 m with the usual voxels. Maps are stored tile by tile."""
 
 _MOST_CHUNKS = 100_000
@@ -48,7 +54,7 @@ def create_array(
     """Creates an array of nothing but its fill value; a chunk is one tile with all its channels."""
     from zarr.codecs import ZstdCodec
 
-    most = {"member": 1, **dict(zip(("x", "y", "z"), TILE, strict=True))}
+    most = {"member": 1, "layer": 1, **dict(zip(("x", "y", "z"), TILE, strict=True))}
     return group.create_array(
         name,
         shape=shape,
@@ -87,9 +93,7 @@ def read_array(
     Raises:
         JaxmapError: it is missing, of another shape or type, or a chunk is damaged or missing.
     """
-    if name not in arrays:
-        raise JaxmapError(f"the array {name} is missing", where=where, fix="make the map again")
-    array = arrays[name]
+    array = present(arrays, name, where)
     _check_form(array, name, where)
     check_kind(array, name, shape, chunks_stored, where)
     fix = "restore the folder from a copy or make the map again"
@@ -98,6 +102,17 @@ def read_array(
     # The codec raises whatever it likes on damaged bytes.
     except Exception as error:
         raise JaxmapError(f"a chunk of {name} is damaged", where=where, fix=fix) from error
+
+
+def present(arrays: Mapping[str, zarr.Array], name: str, where: Path) -> zarr.Array:
+    """An array of a group.
+
+    Raises:
+        JaxmapError: it is missing.
+    """
+    if name not in arrays:
+        raise JaxmapError(f"the array {name} is missing", where=where, fix="make the map again")
+    return arrays[name]
 
 
 def check_kind(array: zarr.Array, name: str, shape: tuple[int, ...], chunks_stored: int | None, where: Path) -> None:
@@ -159,23 +174,27 @@ def stored_chunks(folder: Path) -> list[tuple[int, ...]]:
     return [tuple(map(int, index)) for index in indices if all(part.isdecimal() for part in index)]
 
 
-def read_part(array: zarr.Array, part: tuple[slice, ...], where: Path) -> Float32[np.ndarray, "..."]:
-    """Reads a part of the log-odds.
+def read_part(
+    array: zarr.Array, part: tuple[slice, ...], where: Path, *, finite: bool = True
+) -> Float32[np.ndarray, "..."]:
+    """Reads a part of an array.
 
     Raises:
-        JaxmapError: a tile is damaged, or holds a number that is not finite.
+        JaxmapError: a tile is damaged, or holds a number that is not finite where all should be.
     """
     try:
         values = np.asarray(array[part])
     # The codec raises whatever it likes on damaged bytes.
     except Exception as error:
-        tile = " ".join(str((s.start or 0) // edge) for s, edge in zip(part[1:], array.chunks[1:], strict=False))
+        cut = [(s, edge) for s, edge in zip(part, array.chunks, strict=False) if s.stop is not None]
+        tile = " ".join(str((s.start or 0) // edge) for s, edge in cut)
         raise JaxmapError(
-            f"a chunk of {LOG_ODDS} is damaged, at or beside tile {tile}",
+            f"a chunk of {array.basename} is damaged, at or beside tile {tile}",
             where=where,
             fix="restore the folder from a copy or make the map again",
         ) from error
-    check_finite(values, where)
+    if finite:
+        check_finite(values, where)
     return values
 
 

@@ -16,6 +16,7 @@ from jaxmap.fusion.neighbours import kernel_margin
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
 from jaxmap.fusion.query import TopDown, top_down
+from jaxmap.fusion.surface import ColumnHeights, column_heights
 from jaxmap.host.memory import available_bytes
 from jaxmap.labels import IGNORE
 from jaxmap.mapping.store import Block, Columns, MapReader
@@ -91,6 +92,36 @@ def log_odds_of(reader: MapReader, within: Columns) -> Float[np.ndarray, "K X Y 
         here, there = overlap((place[0], place[1]), within)
         values[(slice(None), *there)] = own[(slice(None), *here)]
     return values
+
+
+def heights_of(reader: MapReader, params: FusionParams, within: Columns) -> ColumnHeights:
+    """What is known of the heights of a rectangle of columns, NumPy; it may reach beyond the grid.
+
+    Raises:
+        JaxmapError: a tile is damaged, or no memory holds the columns.
+    """
+    shape = (within[0].stop - within[0].start, within[1].stop - within[1].start)
+    check_columns(shape, 24, "the heights")
+    height = reader.grid.shape[2]
+    whole = ColumnHeights(
+        np.zeros((4, *shape), np.float32) if reader.surface else None,
+        np.full(shape, height, np.int32),
+        np.full(shape, -1, np.int32),
+    )
+    for block in reader.blocks(0, within):
+        columns = jax.tree.map(np.asarray, column_heights(block.voxel_map, params))
+        size = tuple(own.stop - own.start for own in block.own)
+        place = tuple(slice(a, a + length) for a, length in zip(block.corner, size, strict=True))
+        here, there = overlap((place[0], place[1]), within)
+        for into, values in zip(jax.tree.leaves(whole), jax.tree.leaves(columns), strict=True):
+            into[(..., *there)] = values[(..., *block.own)][(..., *here)]
+    return whole
+
+
+def squares_of(reader: MapReader, edge: int) -> list[Columns]:
+    """The squares of so many columns that hold what was observed; those at the edge reach beyond the grid."""
+    corners = {(x.start // edge, y.start // edge) for x, y in reader.places}
+    return [(slice(x * edge, (x + 1) * edge), slice(y * edge, (y + 1) * edge)) for x, y in sorted(corners)]
 
 
 def nearest_observed(reader: MapReader, column: tuple[float, float]) -> tuple[int, int] | None:

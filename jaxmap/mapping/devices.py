@@ -91,7 +91,7 @@ def on_devices(mapper: Mapper, devices: Sequence[Device]) -> Mapper:
         check_inputs(design, frame, params)
         frame_key = jax.random.fold_in(key, voxel_map.frames_fused + jax.lax.axis_index(_AXIS))
         seen = see_frame(design, voxel_map.grid, frame, params, frame_key)
-        own = evidence_of(seen.sighting, seen.window, params.fusion, design.rule, design.depth_range_m)
+        own = evidence_of(seen.sighting, voxel_map.grid, seen.window, params.fusion, design.rule, design.depth_range_m)
         all_evidence, first = jax.lax.all_gather((own, seen.window.first), _AXIS)
         fused = voxel_map
         for index in range(len(devices)):
@@ -173,7 +173,7 @@ def _batches(frames: Iterable[PreparedFrame], size: int, strict: bool) -> Iterat
 def _placed(frames: Sequence[Frame], mesh: Mesh) -> Batch:
     """The frames, each on its device; where they are too few, with frames in which nothing is seen."""
     devices, count = list(mesh.devices), len(frames)
-    blank = replace(frames[-1], disparity_px=jnp.full_like(frames[-1].disparity_px, jnp.nan))
+    blank = _seen_nothing(frames[-1])
     frames = [*frames, *[blank] * (len(devices) - count)]
 
     def placed(*leaves: Array) -> Array:
@@ -182,3 +182,11 @@ def _placed(frames: Sequence[Frame], mesh: Mesh) -> Batch:
         return jax.make_array_from_single_device_arrays(shape, NamedSharding(mesh, P(_AXIS)), parts)
 
     return Batch(jax.tree.map(placed, *frames), jax.device_put(to_device(count, np.int32), NamedSharding(mesh, P())))
+
+
+def _seen_nothing(frame: Frame) -> Frame:
+    """The frame without any disparity, be it brought or to be matched."""
+    if frame.disparity_px is not None:
+        return replace(frame, disparity_px=jnp.full_like(frame.disparity_px, jnp.nan))
+    assert frame.blind is not None
+    return replace(frame, blind=jnp.ones_like(frame.blind))

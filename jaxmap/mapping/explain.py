@@ -52,7 +52,7 @@ def make_explainer(design: StepDesign, box: GridSpec, params: MapperParams, key:
         key: of the run.
     """
     x, y, z = (min(pair) for pair in zip(design.window_shape, box.shape, strict=True))
-    design = replace(design, window_shape=(x, y, z), members=0)
+    design = replace(design, window_shape=(x, y, z), members=0, match=None)
     empty = make_voxel_map(box, design.labeller.classes)
 
     @jax.jit
@@ -63,7 +63,7 @@ def make_explainer(design: StepDesign, box: GridSpec, params: MapperParams, key:
         labeller, rule, pose = design.labeller, design.rule, frame.T_world_camera
         sigma_px = params.fusion.disparity_sigma_px
         # As in the step, whose own values the compiler takes.
-        cloud = project(params.camera, pose, frame.disparity_px, design.depth_range_m, sigma_px, labeller.ground)
+        cloud = project(params.camera, pose, frame.matched_px, design.depth_range_m, sigma_px, labeller.ground)
         frame_key = jax.random.fold_in(key, number)
         labels, _ = label_points(labeller, frame, cloud, params.labeller, frame_key)
         labels = fusible(labels, labeller.classes, rule)
@@ -71,7 +71,7 @@ def make_explainer(design: StepDesign, box: GridSpec, params: MapperParams, key:
         inside = inside & labels.keep
         hard = harden(labels).labels
         assert hard is not None
-        size = frame.disparity_px.shape
+        size = cloud.valid.shape
         known = (hard >= 0) & (hard < len(labeller.classes))
         return Contribution(
             fused.log_odds,

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int
 
 from jaxmap.errors import UsageError
+from jaxmap.fusion.surface import combine
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.mapping.arrays import TILE
 from jaxmap.mapping.store import Block, MapReader
+from jaxmap.mapping.tile_arrays import Tile
 from jaxmap.mapping.tiles import TileStore, tiles_of, whole_tiles
-from jaxmap.types import MOST_VOXELS_ALONG, GridSpec, to_device
+from jaxmap.types import LAYER, MOST_VOXELS_ALONG, GridSpec, to_device
 
 _FULL_VOXEL = 1e-3
 """Lattices that are less than this share of a voxel apart are one: they are stored in float32."""
@@ -125,31 +127,67 @@ def add_maps(
     """
     done = 0
     for one, shift in zip(maps, shifts, strict=True):
+        higher_m = float(np.asarray(one.attributes.site_origin)[2] - np.asarray(maps[0].attributes.site_origin)[2])
         for block in one.blocks():
             _add(block, shift, store)
+            if store.surface:
+                _add_heights(block, shift, higher_m, store)
             done += 1
             on_block(done)
 
 
-def _add(block: Block, shift: Int[np.ndarray, "3"], store: TileStore) -> None:
-    grid = block.voxel_map.grid
+Slices = tuple[slice, ...]
+
+
+def _add(block: Block, shift: Shift, store: TileStore) -> None:
     values = np.asarray(block.voxel_map.log_odds)[(slice(None), *block.own)]
-    corner = np.asarray(grid.first) + shift + [block.own[0].start or 0, block.own[1].start or 0, 0]
-    box = np.stack([corner, corner + values.shape[1:]])
-    origin = np.asarray(store.grid.first)
+    for tile, here, there in _shared(_corner(block, shift), values.shape[1:], store):
+        if (added := values[(slice(None), *here)]).any():
+            sums = store.read(tile) or store.empty()
+            sums.log_odds[(slice(None), *there)] += added
+            store.write(tile, sums)
+
+
+def _add_heights(block: Block, shift: Shift, higher_m: float, store: TileStore) -> None:
+    """Adds the heights of a block; its layers and those of the sum need not begin at the same height.
+
+    All points of a layer then count in the layer where it begins: that of a column is the same.
+    """
+    assert block.voxel_map.surface is not None
+    values = np.array(np.asarray(block.voxel_map.surface)[(slice(None), *block.own)])
+    values[2] += np.where(values[1] > 0, np.float32(higher_m), 0)
+    low, count = int(np.asarray(store.grid.first)[2]), store.grid.shape[2] // LAYER
+    begins = int(np.asarray(block.voxel_map.grid.first)[2]) // LAYER * LAYER + int(shift[2])
+    for layer in range(values.shape[3]):
+        level = min(max((begins + layer * LAYER - low) // LAYER, 0), count - 1)
+        added = values[..., layer]
+        corner = np.array([*_corner(block, shift)[:2], low + level * LAYER])
+        for tile, here, there in _shared(corner, (*added.shape[1:], LAYER), store):
+            if (part := added[(slice(None), *here[:2])]).any():
+                sums = store.read(tile) or store.empty()
+                assert sums.surface is not None
+                into = (slice(None), *there[:2], 0)
+                sums.surface[into] = combine(sums.surface[into], part)
+                store.write(tile, sums)
+
+
+def _corner(block: Block, shift: Shift) -> Shift:
+    """Where the own columns of a block begin on the lattice of the sum."""
+    own = [block.own[0].start or 0, block.own[1].start or 0, 0]
+    return np.asarray(block.voxel_map.grid.first) + shift + own
+
+
+def _shared(corner: Shift, shape: Sequence[int], store: TileStore) -> Iterator[tuple[Tile, Slices, Slices]]:
+    """The tiles that a box of voxels touches, and what they share with it, as counted in the box and in the tile."""
+    box, origin = np.stack([corner, corner + shape]), np.asarray(store.grid.first)
     for tile in tiles_of(store.grid, box):
-        low = np.maximum(origin + np.multiply(tile, TILE), box[0])
-        high = np.minimum(origin + np.multiply(tile, TILE) + TILE, box[1])
-        here = tuple(slice(a, b) for a, b in zip(low - corner, high - corner, strict=True))
-        added = values[(slice(None), *here)]
-        if not added.any():
-            continue
-        within = low - origin - np.multiply(tile, TILE)
-        there = tuple(slice(a, b) for a, b in zip(within, within + (high - low), strict=True))
-        before = store.read(tile)
-        sums = np.zeros((len(values), *TILE), np.float32) if before is None else np.array(before)
-        sums[(slice(None), *there)] += added
-        store.write(tile, sums)
+        begin = origin + np.multiply(tile, TILE)
+        low, high = np.maximum(begin, box[0]), np.minimum(begin + TILE, box[1])
+        here, there = (
+            tuple(slice(int(a), int(b)) for a, b in zip(low - base, high - base, strict=True))
+            for base in (corner, begin)
+        )
+        yield tile, here, there
 
 
 def _lattice_m(one: MapReader) -> np.ndarray:

@@ -11,30 +11,21 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import sync, write_error
-from jaxmap.mapping.arrays import (
-    AXES,
-    LOG_ODDS,
-    TILE,
-    array_folder,
-    check_finite,
-    create_array,
-    open_group,
-    read_part,
-    stored_chunks,
-)
+from jaxmap.mapping.arrays import LOG_ODDS, SURFACE, TILE, open_group
 from jaxmap.mapping.attributes import MapAttributes, to_json
 from jaxmap.mapping.regions import corner_tile
 from jaxmap.mapping.store import swap_in, sync_tree
-from jaxmap.mapping.tiles import Tile
+from jaxmap.mapping.tile_arrays import Tile, TileArrays, chunk_attributes, values_of
 from jaxmap.types import GridSpec, VoxelMap
 
 RECORD = f"{LOG_ODDS}/tiles.json"
@@ -59,25 +50,19 @@ def write_part(folder: Path, voxel_map: VoxelMap, tiles: Iterable[Tile], told: d
     Raises:
         JaxmapError: the disk refuses, or a number is not finite.
     """
-    import zarr
-
     if folder.exists():
         return
     # Another machine may write the same, in a process of the same number.
     temporary = folder.with_name(f".{folder.name}.tmp-{secrets.token_hex(8)}")
     low = np.asarray(voxel_map.grid.first) // TILE
     values = np.asarray(voxel_map.log_odds)
+    surface = None if voxel_map.surface is None else np.asarray(voxel_map.surface)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        group = zarr.create_group(temporary, zarr_format=3)
-        array = create_array(group, LOG_ODDS, values.shape, AXES)
+        kept = surface is not None
+        arrays = TileArrays.create(temporary, voxel_map.grid, len(values), surface=kept, stored={}, where=folder)
         for tile in tiles:
-            here = tuple(int(a - b) for a, b in zip(tile, low, strict=True))
-            part = tile_part(here)
-            one = np.ascontiguousarray(values[part])
-            check_finite(one, folder)
-            if one.any():
-                array[part] = one
+            arrays.write(tile - low, values_of(values, surface, tile - low))
         (temporary / "told.json").write_text(json.dumps({"first_tile": low.tolist(), **told}), "utf-8")
         sync_tree(temporary)
         try:
@@ -98,13 +83,17 @@ def read_told(folder: Path) -> dict[str, Any]:
     return read_json(folder / "told.json")
 
 
-def part_tiles(folder: Path) -> dict[Tile, Path]:
-    """The files of the tiles of a part, counted along the lattice."""
-    low = read_told(folder)["first_tile"]
-    chunks = folder / LOG_ODDS
+TileFiles = dict[tuple[str, Tile], Path]
+"""Files by the array and the tile that they are of; tiles counted along the lattice."""
+
+
+def part_tiles(folder: Path) -> TileFiles:
+    """The files of the tiles of a part."""
+    low, arrays = read_told(folder)["first_tile"], TileArrays.open(folder, folder, "r")
     return {
-        (x + low[0], y + low[1], z + low[2]): chunks.joinpath("c", "0", str(x), str(y), str(z))
-        for _, x, y, z in stored_chunks(chunks)
+        (name, (x + low[0], y + low[1], z + low[2])): arrays.file(name, (x, y, z))
+        for name, tiles in arrays.stored().items()
+        for x, y, z in tiles
     }
 
 
@@ -114,13 +103,13 @@ class TileRecord(NamedTuple):
     Attributes:
         digest: of the run, whatever the poses: only of one run are tiles of one source the same.
         sources: of each tile that frames touch (`tile_sources`), by its place along the lattice.
-        stored: those of them that are not all zero.
+        stored: the arrays in which they are not all zero, with them.
         frames: what was told of each frame, by name.
     """
 
     digest: str
     sources: dict[Tile, str]
-    stored: set[Tile]
+    stored: set[tuple[str, Tile]]
     frames: dict[str, list[Any]]
 
 
@@ -135,11 +124,11 @@ def read_record(map_folder: Path) -> TileRecord | None:
         return None
     tree = read_json(path)
     try:
-        tiles = {_tile(name): (str(source), bool(stored)) for name, (source, stored) in tree["tiles"].items()}
+        tiles = {_tile(name): (str(source), list(stored)) for name, (source, stored) in tree["tiles"].items()}
         return TileRecord(
             str(tree["digest"]),
             {tile: source for tile, (source, _) in tiles.items()},
-            {tile for tile, (_, stored) in tiles.items() if stored},
+            {(str(name), tile) for tile, (_, stored) in tiles.items() for name in stored},
             {str(name): list(told) for name, told in tree["frames"].items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as fault:
@@ -152,8 +141,10 @@ def assemble_map(
     classes: tuple[str, ...],
     frames_fused: int,
     attributes: MapAttributes,
-    tiles: Mapping[Tile, Path],
+    files: TileFiles,
     record: TileRecord,
+    *,
+    surface: bool,
 ) -> None:
     """Puts a map together from the files of its tiles, and swaps it in as a whole; the files stay.
 
@@ -163,29 +154,31 @@ def assemble_map(
         classes: of the map.
         frames_fused: how many frames it holds.
         attributes: stored beside it.
-        tiles: the files, by their place along the lattice.
+        files: of its tiles.
         record: stored within.
+        surface: whether it keeps heights.
 
     Raises:
         JaxmapError: the disk refuses; what was at `path` is still there.
     """
-    import zarr
-
     temporary = path.with_name(f".{path.name}.new-{os.getpid()}")
     corner = corner_tile(grid)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for stray in path.parent.glob(f".{path.name}.new-*"):
             shutil.rmtree(stray)
-        stored = to_json(grid, classes, frames_fused, attributes) | {"chunks_stored": len(tiles)}
-        group = zarr.create_group(temporary, zarr_format=3, attributes=stored)
-        array = create_array(group, LOG_ODDS, (1 + len(classes), *grid.shape), AXES)
-        for tile, file in tiles.items():
-            here = (str(int(a - b)) for a, b in zip(tile, corner, strict=True))
-            target = array_folder(array).joinpath("c", "0", *here)
+        kept = (LOG_ODDS, SURFACE) if surface else (LOG_ODDS,)
+        counts = {name: sum(of == name for of, _ in files) for name in kept}
+        stored = to_json(grid, classes, frames_fused, attributes) | chunk_attributes(counts)
+        arrays = TileArrays.create(temporary, grid, 1 + len(classes), surface=surface, stored=stored, where=path)
+        for (name, tile), file in files.items():
+            target = arrays.file(name, tile - corner)
             target.parent.mkdir(parents=True, exist_ok=True)
             _link(file, target)
-        named = {_name(tile): [source, tile in tiles] for tile, source in sorted(record.sources.items())}
+        named = {
+            _name(tile): [source, [name for name in kept if (name, tile) in files]]
+            for tile, source in sorted(record.sources.items())
+        }
         tree = {"digest": record.digest, "tiles": named, "frames": record.frames}
         (temporary / RECORD).write_text(json.dumps(tree), "utf-8")
         sync_tree(temporary)
@@ -200,17 +193,19 @@ class KeptTiles(NamedTuple):
     """The tiles of an earlier map that can stay.
 
     Attributes:
-        files: of those that are stored.
+        files: theirs.
         done: all of them, with those that hold nothing but zeros.
         lost: those that should be there and are damaged (the message) or missing.
     """
 
-    files: dict[Tile, Path]
+    files: TileFiles
     done: set[Tile]
     lost: dict[Tile, str]
 
 
-def kept_tiles(path: Path, record: TileRecord, sources: Mapping[Tile, str], grid: GridSpec) -> KeptTiles:
+def kept_tiles(
+    path: Path, record: TileRecord, sources: Mapping[Tile, str], grid: GridSpec, *, surface: bool
+) -> KeptTiles:
     """The tiles of a map that are made of the same frames at the same poses, each read and found whole.
 
     Args:
@@ -218,42 +213,41 @@ def kept_tiles(path: Path, record: TileRecord, sources: Mapping[Tile, str], grid
         record: its own.
         sources: what the tiles of the map to come are made of.
         grid: of the map to come; one on another lattice has none in common.
+        surface: whether that keeps heights; one that does not has none in common with one that does.
 
     Raises:
         JaxmapError: it is no map.
     """
-    arrays, stored = open_group(path, path)
-    array, low = arrays[LOG_ODDS], np.array(stored.get("first_voxel", (0, 0, 0))) // TILE
-    files: dict[Tile, Path] = {}
+    found, stored = open_group(path, path)
+    arrays, low = TileArrays(found, path), np.array(stored.get("first_voxel", (0, 0, 0))) // TILE
+    files: TileFiles = {}
     done: set[Tile] = set()
     lost: dict[Tile, str] = {}
     same_voxels = stored.get("voxel_size_m") == np.asarray(grid.voxel_size_m, np.float64).tolist()
-    if not same_voxels or stored.get("lattice_m") != np.asarray(grid.lattice_m, np.float64).tolist():
+    same_lattice = stored.get("lattice_m") == np.asarray(grid.lattice_m, np.float64).tolist()
+    if not same_voxels or not same_lattice or (SURFACE in arrays.arrays) != surface:
         return KeptTiles(files, done, lost)
     for tile, source in sources.items():
         if record.sources.get(tile) != source:
             continue
-        if tile not in record.stored:
-            done.add(tile)
+        names = [name for name in arrays.arrays if (name, tile) in record.stored]
+        if fault := next(filter(None, (_fault(arrays, name, tile - low) for name in names)), None):
+            lost[tile] = fault
             continue
-        here = tuple(int(a - b) for a, b in zip(tile, low, strict=True))
-        file = array_folder(array).joinpath("c", "0", *map(str, here))
-        if not file.exists():
-            lost[tile] = "is missing"
-            continue
-        try:
-            read_part(array, tile_part(here), path)
-        except JaxmapError:
-            lost[tile] = "is damaged"
-            continue
-        files[tile] = file
+        files |= {(name, tile): arrays.file(name, tile - low) for name in names}
         done.add(tile)
     return KeptTiles(files, done, lost)
 
 
-def tile_part(tile: Sequence[int]) -> tuple[slice, ...]:
-    """Where a tile lies in an array of log-odds that begins with tile 0 0 0."""
-    return (slice(None), *(slice(i * edge, (i + 1) * edge) for i, edge in zip(tile, TILE, strict=True)))
+def _fault(arrays: TileArrays, name: str, tile: Int[np.ndarray, "3"]) -> str:
+    """What is wrong with a tile that should be there; empty where it can be read."""
+    if not arrays.file(name, tile).exists():
+        return "is missing"
+    try:
+        arrays.read(name, tile)
+    except JaxmapError:
+        return "is damaged"
+    return ""
 
 
 def _link(file: Path, target: Path) -> None:

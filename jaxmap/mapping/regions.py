@@ -19,7 +19,8 @@ from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.mapping.arrays import TILE
 from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import Mapper, MapperParams, StepReport
-from jaxmap.mapping.tiles import Tile, block_shape, tiles_of
+from jaxmap.mapping.tile_arrays import Tile
+from jaxmap.mapping.tiles import block_shape, tiles_of
 from jaxmap.types import GridSpec, VoxelMap, make_voxel_map, to_device
 
 Shape = tuple[int, int, int]
@@ -124,7 +125,7 @@ def _boxes(tiles: list[Tile], edges: Sequence[int], axis: int = 0) -> Iterator[l
 def region_shape(
     grid: GridSpec,
     window_shape: Shape,
-    channels: int,
+    channels: float,
     limit_bytes: float,
     touching: Mapping[Tile, Sequence[int]],
     workers: int,
@@ -136,7 +137,7 @@ def region_shape(
     Args:
         grid: of the whole map, in whole tiles.
         window_shape: of the step: no region is smaller.
-        channels: of the map.
+        channels: of the map (`tiles.channels_of`).
         limit_bytes: for one worker.
         touching: the tiles, with the frames that touch them.
         workers: how many.
@@ -187,7 +188,7 @@ def fuse_region(
     Returns:
         The map, and the frames that could not be read, by index: where there are any, the map is not whole.
     """
-    voxel_map = make_voxel_map(grid, classes)
+    voxel_map = make_voxel_map(grid, classes, surface=mapper.design.rule.surface)
     faults: dict[int, JaxmapError] = {}
     for prepared in frames:
         if prepared.frame is None:

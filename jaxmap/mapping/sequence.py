@@ -62,6 +62,7 @@ def prepare_frames(
     label_folder: LabelFolder | None = None,
     *,
     needs: Needs | None = None,
+    matched: bool = True,
     pose_errors: Float[np.ndarray, "N M 6"] | None = None,
     indices: Sequence[int] | None = None,
     workers: int = 2,
@@ -75,6 +76,7 @@ def prepare_frames(
         label_folder: where each frame's labels lie, for the `files` labeller.
         needs: what the labeller asks of each frame (`Labeller.needs`); the rectified left image is delivered,
             as RGB, where it is `image`.
+        matched: with their disparity; else with both images, as RGB, for a step that matches them.
         pose_errors: of the members of an ensemble, for each frame.
         indices: which frames; by default all.
         workers: threads.
@@ -91,10 +93,10 @@ def prepare_frames(
             stages_s: dict[str, float] = {}
             with timed_stage("read", stages_s):
                 pair = sequence.read_pair(ref)
-            rectified = front_end(pair.left, pair.right)
+            rectified = (front_end if matched else front_end.ready)(pair.left, pair.right)
             stages_s |= {"rectify": rectified.rectify_s, "match": rectified.match_s}
-            filled: dict[str, Any] = {}
-            if needs == "image":
+            filled: dict[str, Any] = {} if matched else _to_match(rectified)
+            if needs == "image" or not matched:
                 # All as RGB: a grey image between coloured ones must not change the form of a frame.
                 filled["image"] = to_device(as_rgb(rectified.left))
             if label_folder is not None:
@@ -103,13 +105,20 @@ def prepare_frames(
             if pose_errors is not None:
                 filled["pose_errors"] = to_device(pose_errors[index], np.float32)
             pose = jaxlie.SE3.from_matrix(to_device(T_world_camera[index], np.float32))
-            frame = Frame(to_device(rectified.disparity_px), pose, **filled)
+            disparity_px = to_device(front_end.disparity_of(rectified)) if matched else None
+            frame = Frame(disparity_px, pose, **filled)
         except FrameError as fault:
             return PreparedFrame(index, ref, fault=fault.at(f"frame {ref.name}"))
         return PreparedFrame(index, ref, frame, rectified, stages_s=stages_s)
 
     chosen = range(len(sequence.frames)) if indices is None else indices
     return _in_right_order(prefetch(prepare, chosen, workers, ahead), front_end)
+
+
+def _to_match(rectified: RectifiedFrame) -> dict[str, Any]:
+    """What a frame holds beside its left image for a step that matches it."""
+    blind = np.zeros(rectified.left.shape[:2], bool) if rectified.blind is None else rectified.blind
+    return {"right_image": to_device(as_rgb(rectified.right)), "blind": to_device(blind)}
 
 
 def observed_frames(
@@ -187,7 +196,14 @@ def _in_right_order(frames: Iterator[PreparedFrame], front_end: StereoFrontEnd) 
         yield prepared
 
 
-def frame_form(camera: StereoCamera, labeller: Labeller, members: int = 0, logits_shape: tuple[int, ...] = ()) -> Frame:
+def frame_form(
+    camera: StereoCamera,
+    labeller: Labeller,
+    members: int = 0,
+    logits_shape: tuple[int, ...] = (),
+    *,
+    matched: bool = True,
+) -> Frame:
     """The form of the frames that `prepare_frames` makes for a labeller: shapes without numbers.
 
     Args:
@@ -195,6 +211,7 @@ def frame_form(camera: StereoCamera, labeller: Labeller, members: int = 0, logit
         labeller: what asks for images, labels or probabilities.
         members: of an ensemble.
         logits_shape: of the logits, where the labeller asks for those (`ObservationAttributes.kept_shape`).
+        matched: with their disparity; else with both images.
     """
     size = (camera.height_px, camera.width_px)
     kinds: dict[Needs, tuple[tuple[int, ...], DTypeLike]] = {
@@ -206,8 +223,12 @@ def frame_form(camera: StereoCamera, labeller: Labeller, members: int = 0, logit
 
     def frame() -> Frame:
         filled: dict[str, Any] = {} if labeller.needs is None else {labeller.needs: jnp.zeros(*kinds[labeller.needs])}
+        if not matched:
+            filled |= {name: jnp.zeros((*size, 3), np.uint8) for name in ("image", "right_image")}
+            filled["blind"] = jnp.zeros(size, bool)
         pose_errors = jnp.zeros((members, 6), np.float32) if members else None
-        return Frame(jnp.zeros(size, np.float32), jaxlie.SE3.identity(), pose_errors=pose_errors, **filled)
+        disparity_px = jnp.zeros(size, np.float32) if matched else None
+        return Frame(disparity_px, jaxlie.SE3.identity(), pose_errors=pose_errors, **filled)
 
     return jax.eval_shape(frame)
 

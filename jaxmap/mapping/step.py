@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt8
 
@@ -26,6 +27,9 @@ from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
 from jaxmap.labels import IGNORE
+from jaxmap.matching.design import MatchDesign, MatchParams
+from jaxmap.matching.match import match
+from jaxmap.matching.rectify import RawPair, rectify_pair, rectifying_rotations
 from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
 
 Arguments = ParamSpec("Arguments")
@@ -37,13 +41,16 @@ Result = TypeVar("Result")
 class MapperParams:
     """All the numbers the step depends on; every leaf is differentiable.
 
-    `labeller` are `Labeller.params`, `ensemble` the numbers of an ensemble's members, where the mapper has any.
+    `labeller` are `Labeller.params`, `ensemble` the numbers of an ensemble's members, where the mapper has any; `match`
+    those of stereo matching, where the step matches, and `raw` the calibration of the images, where it rectifies them.
     """
 
     camera: StereoCamera
     fusion: FusionParams
     labeller: LabellerParams = NO_NUMBERS
     ensemble: EnsembleParams | None = None
+    match: MatchParams | None = None
+    raw: RawPair | None = None
 
 
 class StepReport(NamedTuple):
@@ -72,6 +79,7 @@ class StepDesign:
         depth_range_m: points nearer or farther are left out.
         window_shape: voxels of a part of the grid that holds all that a frame can touch.
         members: of an ensemble that is fused beside the map.
+        match: how the step matches the images of a frame; None where frames come with their disparity.
     """
 
     labeller: Labeller
@@ -79,6 +87,7 @@ class StepDesign:
     depth_range_m: tuple[float, float]
     window_shape: tuple[int, int, int]
     members: int = 0
+    match: MatchDesign | None = None
 
 
 def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -96,10 +105,14 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
 
 
 class SeenFrame(NamedTuple):
-    """What one frame shows, before it is added to a map: its labelled points, and the window of the map they lie in."""
+    """What one frame shows, before it is added to a map: its labelled points, and the window of the map they lie in.
+
+    `frame` is itself, matched.
+    """
 
     sighting: Sighting
     window: GridSpec
+    frame: Frame
     in_range: Int[Array, ""]
     estimate: PyTree
 
@@ -114,9 +127,10 @@ def fuse_frame(
     fused, counted = add_sighting(voxel_map, seen.sighting, seen.window, params.fusion, rule, design.depth_range_m)
     if design.members:
         assert params.ensemble is not None
-        depth_range_m, shape, labels = design.depth_range_m, design.window_shape, seen.sighting.labels
+        depth_range_m, shape = design.depth_range_m, design.window_shape
+        camera, labels = seen.sighting.camera, seen.sighting.labels
         own = fuse_members(
-            voxel_map, frame, labels, params.camera, params.ensemble, frame_key, rule, depth_range_m, shape
+            voxel_map, seen.frame, labels, camera, params.ensemble, frame_key, rule, depth_range_m, shape
         )
         fused = replace(fused, members=own)
     return fused, report_of(seen, counted)
@@ -128,16 +142,17 @@ def see_frame(
 ) -> SeenFrame:
     """What a frame shows of a grid: all of the step but the sum over voxels."""
     labeller, rule, depth_range_m = design.labeller, design.rule, design.depth_range_m
-    camera, pose, fusion = params.camera, frame.T_world_camera, params.fusion
+    frame, camera = matched(design.match, frame, params)
+    pose, fusion = frame.T_world_camera, params.fusion
 
-    cloud = project(camera, pose, frame.disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
+    cloud = project(camera, pose, frame.matched_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
     labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
     weights = point_weights(grid, cloud, rule)
     height_sigma_m = height_sigma(cloud, pose.translation()[2]) if rule.surface else None
     sighting = Sighting(camera, pose, cloud.points_world, labels, weights, height_sigma_m, cloud.depth_m, cloud.valid)
-    return SeenFrame(sighting, window, cloud.in_range.sum(), estimate)
+    return SeenFrame(sighting, window, frame, cloud.in_range.sum(), estimate)
 
 
 def report_of(seen: SeenFrame, counted: Counted) -> StepReport:
@@ -152,6 +167,46 @@ def report_of(seen: SeenFrame, counted: Counted) -> StepReport:
     )
 
 
+def matched(design: MatchDesign | None, frame: Frame, params: MapperParams) -> tuple[Frame, StereoCamera]:
+    """The frame as the rest of the step takes it, with its disparity, and the rectified camera that sees it.
+
+    The disparity is the frame's own or, with a design, that of its images, which are rectified before where the
+    params hold the calibration of a raw pair.
+    """
+    if design is None:
+        return frame, params.camera
+    frame, camera = rectified(design, frame, params)
+    assert frame.image is not None and frame.right_image is not None and params.match is not None
+    with jax.named_scope("match"):
+        disparity_px = match(design, frame.image, frame.right_image, params.match)
+    if frame.blind is not None:
+        disparity_px = jnp.where(frame.blind, jnp.nan, disparity_px)
+    return replace(frame, disparity_px=disparity_px), camera
+
+
+def rectified(design: MatchDesign, frame: Frame, params: MapperParams) -> tuple[Frame, StereoCamera]:
+    """The frame with rectified images, and the camera, whose baseline is that of the raw pair where there is one.
+
+    The pose of a frame with raw images is that of the raw left camera.
+    """
+    raw, camera = params.raw, params.camera
+    if raw is None:
+        return frame, camera
+    assert frame.image is not None and frame.right_image is not None
+    with jax.named_scope("rectify"):
+        pair = rectify_pair(raw, camera, frame.image, frame.right_image)
+        # Gradients pass through fractions of grey levels alone.
+        left, right = (
+            image if design.soft else jnp.round(image).astype(jnp.uint8) for image in (pair.left, pair.right)
+        )
+        R_rectified_raw, _ = rectifying_rotations(raw)
+        pose = frame.T_world_camera @ jaxlie.SE3.from_rotation(R_rectified_raw.inverse())
+        blind = ~pair.left_seen if frame.blind is None else frame.blind | ~pair.left_seen
+        baseline_m = jnp.linalg.norm(raw.T_right_left.translation())
+    frame = replace(frame, T_world_camera=pose, image=left, right_image=right, blind=blind)
+    return frame, replace(camera, baseline_m=baseline_m)
+
+
 @in_full_float32
 def perceive_frame(
     labeller: Labeller,
@@ -164,7 +219,7 @@ def perceive_frame(
     assert labeller.perceive is not None
     depths_m = (0.0, float("inf"))
     pose = frame.T_world_camera
-    cloud = project(camera, pose, frame.disparity_px, depths_m, disparity_sigma_px, labeller.ground)
+    cloud = project(camera, pose, frame.matched_px, depths_m, disparity_sigma_px, labeller.ground)
     return labeller.perceive(frame, cloud, params)
 
 
@@ -175,10 +230,11 @@ def label_image(
     """The labels that the step gives the pixels of the frame when `number` frames were fused before it."""
     frame_key = jax.random.fold_in(key, number)
     sigma_px, ground = params.fusion.disparity_sigma_px, design.labeller.ground
-    cloud = project(params.camera, frame.T_world_camera, frame.disparity_px, design.depth_range_m, sigma_px, ground)
+    frame, camera = matched(design.match, frame, params)
+    cloud = project(camera, frame.T_world_camera, frame.matched_px, design.depth_range_m, sigma_px, ground)
     labels = harden(label_points(design.labeller, frame, cloud, params.labeller, frame_key)[0])
     assert labels.labels is not None
-    return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(frame.disparity_px.shape)
+    return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(cloud.valid.shape)
 
 
 Step = Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepReport]]
@@ -220,6 +276,7 @@ def make_mapper(
     depth_range_m: tuple[float, float],
     *,
     members: int = 0,
+    match: MatchDesign | None = None,
     T_world_camera: Float[np.ndarray, "N 4 4"] | None = None,
 ) -> Mapper:
     """Builds a mapper.
@@ -233,6 +290,9 @@ def make_mapper(
         depth_range_m: points nearer or farther than these are left out.
         members: of an ensemble that is fused beside the map; its params then hold `ensemble`, its frames
             `pose_errors`.
+        match: how the step matches the images of a frame (`image` and `right_image`); its params then hold `match`.
+            Without it, frames bring their disparity. With `raw` (`stereo.rectify.make_raw_pair`) in its params as well,
+            the images are raw, and the pose of a frame is that of the raw left camera.
         T_world_camera: the poses of all frames, where they are known beforehand: the windows then are no larger
             than these need. What a frame of another pose sees beyond its window is left out.
 
@@ -250,7 +310,7 @@ def make_mapper(
             "an ensemble needs a class whose misses it estimates", where="mapper", fix="name one in priority_classes"
         )
     shape = window_shape(grid, camera, max_depth_m, T_world_camera)
-    design = StepDesign(labeller, rule, depth_range_m, shape, members)
+    design = StepDesign(labeller, rule, depth_range_m, shape, members, match)
 
     def fuse(voxel_map: VoxelMap, frame: Frame, params: MapperParams, key: PRNGKeyArray) -> tuple[VoxelMap, StepReport]:
         check_inputs(design, frame, params)
@@ -336,6 +396,25 @@ def check_inputs(design: StepDesign, frame: Frame, params: MapperParams) -> None
             where="mapper",
             fix="fill MapperParams.ensemble and Frame.pose_errors",
         )
+    _check_matching(design, frame, params)
+
+
+def _check_matching(design: StepDesign, frame: Frame, params: MapperParams) -> None:
+    """Refuses a frame or params that lack what matching needs, and a frame that is matched already."""
+    if design.match is None:
+        _ = frame.matched_px
+        return
+    if frame.disparity_px is not None:
+        raise JaxmapError("the frame is matched already", where="mapper", fix="leave out Frame.disparity_px, or match")
+    if frame.image is None or frame.right_image is None or params.match is None:
+        raise JaxmapError(
+            "the step has nothing to match",
+            where="mapper",
+            fix="fill Frame.image, Frame.right_image and MapperParams.match",
+        )
+    if frame.image.shape != frame.right_image.shape:
+        left, right = (tuple(image.shape) for image in (frame.image, frame.right_image))
+        raise JaxmapError(f"the left image is {left}, the right one {right}", where="mapper", fix="give equal ones")
 
 
 class _Tensors(NamedTuple):

@@ -8,33 +8,39 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.files import sync, write_error
 from jaxmap.mapping.arrays import (
     AXES,
+    LAYER_AXES,
     LOG_ODDS,
     MEMBERS,
     SURFACE,
+    SURFACE_AXES,
     StoredArray,
+    array_folder,
     check_finite,
     check_kind,
     chunk_counts,
+    create_array,
     open_group,
+    present,
     read_array,
     read_part,
     stored_chunks,
     write_array,
 )
 from jaxmap.mapping.attributes import MapAttributes, from_json, to_json
-from jaxmap.types import GridSpec, VoxelMap, to_device
+from jaxmap.types import GridSpec, VoxelMap, layer_count, to_device
 
 if TYPE_CHECKING:
     import zarr
@@ -110,7 +116,8 @@ def load_map(path: str | os.PathLike[str], *, members: bool = False) -> tuple[Vo
         check_finite(ensemble, target)
     surface = None
     if SURFACE in arrays:
-        surface = read_array(arrays, SURFACE, (4, *grid.shape[:2]), chunk_counts(stored, target).get(SURFACE), target)
+        shape = (4, *grid.shape[:2], layer_count(grid.shape[2]))
+        surface = read_array(arrays, SURFACE, shape, chunk_counts(stored, target).get(SURFACE), target)
         check_finite(surface, target)
     voxel_map = VoxelMap(
         log_odds=jnp.asarray(log_odds),
@@ -161,23 +168,32 @@ class MapReader:
         grid: of the whole map.
         classes: its classes.
         frames_fused: how many frames it holds.
-        attributes: what is stored beside it.
+        attributes: what is stored beside it; of its layers the names alone.
+        surface: whether it keeps heights.
         places: where its blocks lie in the grid; what lies in none was not observed.
         blocks: `(margin=0, within=None) -> Iterator[Block]`, blocks that together hold all that was observed, each
             column once, with as many columns around them; of those only the ones that touch the columns `within`.
+        layers: `(columns) -> {name: array}`, the layers of the top-down map over a rectangle of the grid.
     """
 
     grid: GridSpec
     classes: tuple[str, ...]
     frames_fused: int
     attributes: MapAttributes
+    surface: bool
     places: tuple[Columns, ...]
     blocks: Callable[..., Iterator[Block]]
+    layers: Callable[[Columns], dict[str, Float[np.ndarray, "X Y"]]]
+
+    @property
+    def whole(self) -> Columns:
+        """All columns of the grid."""
+        return slice(0, self.grid.shape[0]), slice(0, self.grid.shape[1])
 
     def extent(self) -> Columns:
         """The smallest rectangle that holds all blocks; the whole grid where there is none."""
         if not self.places:
-            return slice(0, self.grid.shape[0]), slice(0, self.grid.shape[1])
+            return self.whole
         x, y = (
             slice(min(part.start for part in along), max(part.stop for part in along))
             for along in zip(*self.places, strict=True)
@@ -193,7 +209,11 @@ def in_memory(voxel_map: VoxelMap, attributes: MapAttributes) -> MapReader:
     def blocks(margin: int = 0, within: Columns | None = None) -> Iterator[Block]:
         yield Block(voxel_map, whole, (0, 0))
 
-    return MapReader(voxel_map.grid, voxel_map.classes, count, attributes, (whole,), blocks)
+    def layers(place: Columns) -> dict[str, Float[np.ndarray, "X Y"]]:
+        return {name: np.asarray(values)[place] for name, values in attributes.layers.items()}
+
+    kept = voxel_map.surface is not None
+    return MapReader(voxel_map.grid, voxel_map.classes, count, attributes, kept, (whole,), blocks, layers)
 
 
 def touch(one: Columns, other: Columns) -> bool:
@@ -202,7 +222,7 @@ def touch(one: Columns, other: Columns) -> bool:
 
 
 def open_map(path: str | os.PathLike[str]) -> MapReader:
-    """Opens a map of any size; only its attributes, and the layers of the top-down map, are read at once.
+    """Opens a map of any size; only its attributes are read at once.
 
     Raises:
         JaxmapError: as `load_map`; a damaged tile is found when its block is read, and named.
@@ -212,7 +232,12 @@ def open_map(path: str | os.PathLike[str]) -> MapReader:
     grid, classes, frames_fused, attributes = from_json(stored, target)
     array = arrays[LOG_ODDS]
     check_kind(array, LOG_ODDS, (1 + len(classes), *grid.shape), stored.get("chunks_stored"), target)
-    _read_layers(arrays, stored, grid, attributes, target)
+    counts, heights = chunk_counts(stored, target), arrays.get(SURFACE)
+    if heights is not None:
+        shape = (4, *grid.shape[:2], layer_count(grid.shape[2]))
+        check_kind(heights, SURFACE, shape, counts.get(SURFACE), target)
+    for name in attributes.layers:
+        check_kind(present(arrays, name, target), name, grid.shape[:2], counts.get(name), target)
 
     edge = array.chunks[1:3]
     places = tuple(
@@ -232,10 +257,59 @@ def open_map(path: str | os.PathLike[str]) -> MapReader:
             first = np.asarray(grid.first) + np.array([around[0].start, around[1].start, 0])
             part = replace(grid, first=to_device(first, np.int32), shape=log_odds.shape[1:])
             x, y = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(place, around, strict=True))
-            voxel_map = VoxelMap(jnp.asarray(log_odds), to_device(frames_fused, np.int32), part, classes)
+            surface = None
+            if heights is not None:
+                surface = jnp.asarray(read_part(heights, (slice(None), *around, slice(None)), target))
+            count = to_device(frames_fused, np.int32)
+            voxel_map = VoxelMap(jnp.asarray(log_odds), count, part, classes, surface=surface)
             yield Block(voxel_map, (x, y), (place[0].start, place[1].start))
 
-    return MapReader(grid, classes, frames_fused, attributes, places, blocks)
+    def layers(place: Columns) -> dict[str, Float[np.ndarray, "X Y"]]:
+        return {name: read_part(arrays[name], place, target, finite=False) for name in attributes.layers}
+
+    kept = heights is not None
+    return MapReader(grid, classes, frames_fused, attributes, kept, places, blocks, layers)
+
+
+def add_layers(
+    path: str | os.PathLike[str],
+    names: Sequence[str],
+    parts: Iterable[tuple[Columns, Mapping[str, Float[np.ndarray, "X Y"]]]],
+) -> None:
+    """Adds layers to the top-down map of a stored map, part by part: they are there when all are written.
+
+    Args:
+        path: of the map.
+        names: of the layers; those that are there are written anew.
+        parts: rectangles of columns, of whole tiles, and the layers there; what is beyond the grid is left out.
+
+    Raises:
+        JaxmapError: the disk refuses; the map then is without them.
+    """
+    import zarr
+
+    target = Path(path)
+    try:
+        group = zarr.open_group(target, mode="r+", zarr_format=3)
+        stored = dict(group.attrs)
+        grid, *_, attributes = from_json(stored, target)
+        others = [name for name in attributes.layers if name not in names]
+        counts = {name: count for name, count in chunk_counts(stored, target).items() if name not in names}
+        group.update_attributes({"layers": others, "chunks_stored_of": counts})
+        for name in names:
+            shutil.rmtree(target / name, ignore_errors=True)
+        arrays = {name: create_array(group, name, grid.shape[:2], LAYER_AXES, np.nan) for name in names}
+        for place, layers in parts:
+            for name, array in arrays.items():
+                inside = tuple(slice(s.start, min(s.stop, size)) for s, size in zip(place, array.shape, strict=True))
+                array[inside] = layers[name][tuple(slice(0, s.stop - s.start) for s in inside)]
+        counts |= {name: len(stored_chunks(array_folder(array))) for name, array in arrays.items()}
+        for name in names:
+            sync_tree(target / name)
+        group.update_attributes({"layers": [*others, *names], "chunks_stored_of": counts})
+        sync(target / "zarr.json")
+    except OSError as error:
+        raise write_error(error, target) from error
 
 
 def _read_layers(
@@ -252,9 +326,9 @@ def _arrays_of(voxel_map: VoxelMap, attributes: MapAttributes) -> dict[str, Stor
     if voxel_map.members is not None:
         arrays[MEMBERS] = StoredArray(np.asarray(voxel_map.members), ("member", *AXES))
     if voxel_map.surface is not None:
-        arrays[SURFACE] = StoredArray(np.asarray(voxel_map.surface), ("channel", *AXES[1:3]))
+        arrays[SURFACE] = StoredArray(np.asarray(voxel_map.surface), SURFACE_AXES)
     for name, values in attributes.layers.items():
-        arrays[name] = StoredArray(np.asarray(values, np.float32), ("x", "y"), fill_value=np.nan)
+        arrays[name] = StoredArray(np.asarray(values, np.float32), LAYER_AXES, fill_value=np.nan)
     return arrays
 
 

@@ -14,34 +14,27 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Int
 
 from jaxmap.errors import JaxmapError
 from jaxmap.host.bounded_text import read_json
 from jaxmap.host.files import atomic_path, sync, write_error
-from jaxmap.mapping.arrays import (
-    AXES,
-    LOG_ODDS,
-    TILE,
-    array_folder,
-    check_finite,
-    create_array,
-    open_group,
-    read_part,
-    stored_chunks,
-)
+from jaxmap.mapping.arrays import LOG_ODDS, SURFACE, TILE, array_folder, open_group
 from jaxmap.mapping.attributes import MapAttributes, to_json
-from jaxmap.types import GridSpec, VoxelMap, to_device
-
-if TYPE_CHECKING:
-    import zarr
-
-Tile = tuple[int, int, int]
-"""The place of a tile in the grid, counted in tiles."""
+from jaxmap.mapping.tile_arrays import (
+    Tile,
+    TileArrays,
+    TileValues,
+    chunk_attributes,
+    surface_part,
+    tile_part,
+    values_of,
+)
+from jaxmap.types import LAYER, GridSpec, VoxelMap, layer_count, to_device
 
 
 def whole_tiles(grid: GridSpec) -> GridSpec:
@@ -52,8 +45,14 @@ def whole_tiles(grid: GridSpec) -> GridSpec:
     return replace(grid, first=to_device(first, np.int32), shape=(x, y, z))
 
 
+def channels_of(class_count: int, *, surface: bool) -> float:
+    """Numbers that a map holds for each of its voxels; heights are fewer than their layers have voxels."""
+    # Two layers in place of one: blocks may be as low as a tile.
+    return 1 + class_count + (4 * 2 / LAYER if surface else 0)
+
+
 def block_shape(
-    grid: GridSpec, window_shape: tuple[int, int, int], channels: int, limit_bytes: float
+    grid: GridSpec, window_shape: tuple[int, int, int], channels: float, limit_bytes: float
 ) -> tuple[int, int, int] | None:
     """Voxels along each axis of the block that is kept in memory: whole tiles that hold a window wherever it lies.
 
@@ -89,15 +88,16 @@ class TileStore:
         path: of the map.
         grid: of the whole map, in whole tiles.
         classes: of the map.
+        surface: whether it keeps heights.
     """
 
-    def __init__(self, path: Path, grid: GridSpec, classes: tuple[str, ...]) -> None:
+    def __init__(self, path: Path, grid: GridSpec, classes: tuple[str, ...], *, surface: bool = False) -> None:
         """Opens the map at `path`, or begins an empty one; a commit that was cut off is carried out.
 
         Raises:
             JaxmapError: something else is at `path`, it is damaged or of another form, or the disk refuses.
         """
-        self.path, self.grid, self.classes = path, grid, classes
+        self.path, self.grid, self.classes, self.surface = path, grid, classes, surface
         self._waiting = path.with_name(f".{path.name}.next")
         self._record = self._waiting / "commit.json"
         try:
@@ -109,51 +109,62 @@ class TileStore:
             self._begin(self._waiting, {})
         except OSError as error:
             raise write_error(error, path) from error
-        self._committed = open_group(path, path)[0][LOG_ODDS]
-        if self._committed.shape != (1 + len(classes), *grid.shape):
+        self._committed = TileArrays(open_group(path, path)[0], path)
+        there, needed = (self._committed.arrays[LOG_ODDS].shape, (1 + len(classes), *grid.shape))
+        if there != needed or len(self._committed.arrays) != 1 + surface:
+            kept = [
+                f"{shape} with{'' if heights else 'out'} heights"
+                for shape, heights in ((there, len(self._committed.arrays) > 1), (needed, surface))
+            ]
             raise JaxmapError(
-                f"it has the shape {self._committed.shape}, the run needs {(1 + len(classes), *grid.shape)}",
-                where=path,
-                fix="map it anew with --overwrite",
+                f"it has the shape {kept[0]}, the run needs {kept[1]}", where=path, fix="map it anew with --overwrite"
             )
-        self._next = self._array(self._waiting)
-        # Listed once: a map of kilometres has tens of thousands.
-        self._there: set[Tile] = {(x, y, z) for _, x, y, z in stored_chunks(array_folder(self._committed))}
-        self._removed: set[Tile] = set()
+        self._next = TileArrays.open(self._waiting, path, "r+")
+        self._there = self._committed.stored()
+        self._removed: set[tuple[str, Tile]] = set()
 
     def tiles(self) -> set[Tile]:
         """The tiles that are there, waiting ones among them."""
-        return set(self._there)
+        return set().union(*self._there.values())
 
-    def read(self, tile: Tile) -> Float32[np.ndarray, "K X Y Z"] | None:
+    def read(self, tile: Tile) -> TileValues | None:
         """What was last written of a tile; None where that is nothing.
 
         Raises:
             JaxmapError: it is damaged.
         """
-        if tile not in self._there:
+        if not any(tile in tiles for tiles in self._there.values()):
             return None
-        waits = _chunk_file(self._next, tile).exists()
-        return read_part(self._next if waits else self._committed, _part(tile), self.path)
+        return TileValues(**{name: self._source(name, tile).read(name, tile) for name in self._there})
 
-    def write(self, tile: Tile, log_odds: Float32[np.ndarray, "K X Y Z"]) -> None:
+    def empty(self) -> TileValues:
+        """A tile of zeros."""
+        surface = np.zeros((4, *TILE[:2], 1), np.float32) if self.surface else None
+        return TileValues(np.zeros((1 + len(self.classes), *TILE), np.float32), surface)
+
+    def _source(self, name: str, tile: Tile) -> TileArrays:
+        """Where an array has what was last written of a tile; what was removed is empty in both."""
+        waits = (name, tile) in self._removed or self._next.file(name, tile).exists()
+        return self._next if waits else self._committed
+
+    def write(self, tile: Tile, values: TileValues) -> None:
         """Writes a tile, to be part of the map with the next commit; one of nothing but zeros is removed.
 
         Raises:
             JaxmapError: the disk refuses, or a number is not finite.
         """
-        check_finite(log_odds, self.path)
         try:
-            self._next[_part(tile)] = log_odds
+            self._next.write(tile, values)
         except OSError as error:
             raise write_error(error, self.path) from error
-        if log_odds.any():
-            self._removed.discard(tile)
-            self._there.add(tile)
-        else:
-            self._there.discard(tile)
-            if _chunk_file(self._committed, tile).exists():
-                self._removed.add(tile)
+        for name, tiles in self._there.items():
+            if getattr(values, name).any():
+                self._removed.discard((name, tile))
+                tiles.add(tile)
+            else:
+                tiles.discard(tile)
+                if self._committed.file(name, tile).exists():
+                    self._removed.add((name, tile))
 
     def commit(self, frames_fused: int, attributes: MapAttributes) -> None:
         """Makes the waiting tiles part of the map, with the attributes, all at once.
@@ -161,8 +172,9 @@ class TileStore:
         Raises:
             JaxmapError: the disk refuses; the map is that of the commit before.
         """
-        stored = to_json(self.grid, self.classes, frames_fused, attributes)
-        stored["chunks_stored"] = len(self._there)
+        # Layers that were added to a map before it grew are its own no more.
+        stored = {"layers": []} | to_json(self.grid, self.classes, frames_fused, attributes)
+        stored |= chunk_attributes({name: len(tiles) for name, tiles in self._there.items()})
         record = {"attributes": stored, "removed": sorted(self._removed)}
         try:
             for parent, _, names in os.walk(self._waiting):
@@ -174,7 +186,8 @@ class TileStore:
             self._apply(record)
             self._record.unlink()
             # The folders that the tiles have left would be gone through at each commit to come.
-            shutil.rmtree(array_folder(self._next) / "c", ignore_errors=True)
+            for array in self._next.arrays.values():
+                shutil.rmtree(array_folder(array) / "c", ignore_errors=True)
         except OSError as error:
             raise write_error(error, self.path) from error
         self._removed.clear()
@@ -185,34 +198,30 @@ class TileStore:
 
     def _begin(self, folder: Path, stored: dict[str, Any]) -> None:
         """Makes an empty group of the form of the map, whole or not at all."""
-        import zarr
-
         folder.parent.mkdir(parents=True, exist_ok=True)
         temporary = folder.with_name(f".{folder.name}.new-{os.getpid()}")
         shutil.rmtree(temporary, ignore_errors=True)
-        group = zarr.create_group(temporary, zarr_format=3, attributes=stored | {"chunks_stored": 0})
-        create_array(group, LOG_ODDS, (1 + len(self.classes), *self.grid.shape), AXES)
+        empty = chunk_attributes({LOG_ODDS: 0, **({SURFACE: 0} if self.surface else {})})
+        channels = 1 + len(self.classes)
+        TileArrays.create(temporary, self.grid, channels, surface=self.surface, stored=stored | empty, where=folder)
         os.rename(temporary, folder)
-
-    def _array(self, folder: Path) -> zarr.Array:
-        import zarr
-
-        return zarr.open_array(folder / LOG_ODDS, mode="r+", zarr_format=3)
 
     def _apply(self, record: dict[str, Any]) -> None:
         """Carries a commit out; whatever part of it was done before is not done again."""
         import zarr
 
-        waiting, committed = self._array(self._waiting), self._array(self.path)
+        waiting, committed = (TileArrays.open(one, self.path, "r+") for one in (self._waiting, self.path))
         changed = {self.path}
-        for _, *tile in stored_chunks(array_folder(waiting)):
-            target = _chunk_file(committed, tile)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(_chunk_file(waiting, tile), target)
-            changed.update(target.parents[: len(tile) + 2])
-        for tile in record["removed"]:
-            _chunk_file(committed, tile).unlink(missing_ok=True)
-            changed.add(_chunk_file(committed, tile).parent)
+        for name, tiles in waiting.stored().items():
+            for tile in tiles:
+                target = committed.file(name, tile)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(waiting.file(name, tile), target)
+                changed.update(target.parents[: len(tile) + 2])
+        for name, tile in record["removed"]:
+            target = committed.file(name, tile)
+            target.unlink(missing_ok=True)
+            changed.add(target.parent)
         zarr.open_group(self.path, mode="r+", zarr_format=3).update_attributes(record["attributes"])
         sync(self.path / "zarr.json")
         for folder in changed:
@@ -254,6 +263,8 @@ class MovingBlock:
             count = int(voxel_map.frames_fused)
             # Freed before the next one is made: a block is most of the memory.
             voxel_map.log_odds.delete()
+            if voxel_map.surface is not None:
+                voxel_map.surface.delete()
             voxel_map = self._load(self._around(box), count)
         for view in views:
             self._touched |= set(tiles_of(self.store.grid, view))
@@ -273,10 +284,10 @@ class MovingBlock:
     def write_changes(self, voxel_map: VoxelMap) -> None:
         """Writes the tiles of the block that have changed, to be committed."""
         values, first = np.asarray(voxel_map.log_odds), np.asarray(voxel_map.grid.first)
+        surface = None if voxel_map.surface is None else np.asarray(voxel_map.surface)
         offset = (first - np.asarray(self.store.grid.first)) // TILE
         for tile in sorted(self._touched):
-            part = _part(np.asarray(tile) - offset)
-            self.store.write(tile, np.ascontiguousarray(values[part]))
+            self.store.write(tile, values_of(values, surface, np.asarray(tile) - offset))
         self._touched.clear()
 
     def _around(self, box: Int[np.ndarray, "2 3"]) -> Int[np.ndarray, "3"]:
@@ -291,13 +302,19 @@ class MovingBlock:
     def _load(self, first: Int[np.ndarray, "3"], frames_fused: int) -> VoxelMap:
         grid = replace(self.store.grid, first=to_device(first, np.int32), shape=self._shape)
         values = np.zeros((1 + len(self.store.classes), *self._shape), np.float32)
+        surface = None
+        if self.store.surface:
+            surface = np.zeros((4, *self._shape[:2], layer_count(self._shape[2])), np.float32)
         offset = (first - np.asarray(self.store.grid.first)) // TILE
         for tile in tiles_of(self.store.grid, np.stack([first, first + self._shape])):
             if (stored := self.store.read(tile)) is not None:
-                values[_part(np.asarray(tile) - offset)] = stored
+                values[tile_part(np.asarray(tile) - offset)] = stored.log_odds
+                if surface is not None:
+                    surface[surface_part(np.asarray(tile) - offset)] = stored.surface
         # One copy; `jnp.array` would make two.
-        log_odds = jax.device_put(values, may_alias=False)
-        return VoxelMap(log_odds, to_device(frames_fused, np.int32), grid, self.store.classes)
+        log_odds, surface = jax.device_put((values, surface), may_alias=False)
+        count = to_device(frames_fused, np.int32)
+        return VoxelMap(log_odds, count, grid, self.store.classes, surface=surface)
 
 
 def tiles_of(grid: GridSpec, box: Int[np.ndarray, "2 3"]) -> Iterator[Tile]:
@@ -306,11 +323,3 @@ def tiles_of(grid: GridSpec, box: Int[np.ndarray, "2 3"]) -> Iterator[Tile]:
     if (high > low).all():
         x, y, z = (range(int(a) // edge, -(-int(b) // edge)) for a, b, edge in zip(low, high, TILE, strict=True))
         yield from product(x, y, z)
-
-
-def _part(tile: Tile | Int[np.ndarray, "3"]) -> tuple[slice, ...]:
-    return (slice(None), *(slice(int(i) * edge, (int(i) + 1) * edge) for i, edge in zip(tile, TILE, strict=True)))
-
-
-def _chunk_file(array: zarr.Array, tile: Any) -> Path:
-    return array_folder(array).joinpath("c", "0", *(str(int(index)) for index in tile))

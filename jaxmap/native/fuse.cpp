@@ -148,7 +148,15 @@ struct Frame {
   int classes;
   Rule rule;
   float* log_odds;  // (1 + classes, map)
-  float* surface;   // (4, columns of the map), or null
+  float* surface;   // (4, columns and layers of the map), or null
+  int64_t layer, map_layers;  // voxels of the lattice to a layer, and layers of the map
+
+  // The layer of the window that one of its voxels lies in.
+  int32_t layer_of(int32_t z) const { return floor_divide(first[2] + z) - floor_divide(first[2]); }
+  int32_t floor_divide(int32_t index) const {
+    return int32_t(index >= 0 ? index / layer : -((layer - 1 - index) / layer));
+  }
+  int32_t window_layers() const { return int32_t(shape[2] / layer) + 2; }
 
   int64_t cell(int64_t x, int64_t y, int64_t z) const {
     return ((corner[0] + x) * map_shape[1] + corner[1] + y) * map_shape[2] + corner[2] + z;
@@ -262,7 +270,8 @@ void add_runs(const Frame& frame, int32_t blocks, int32_t low, int32_t high, Wor
         for (int r = 0; r < rows; ++r) row[r] += work.weights.numbers[run * rows + r];
       }
       if (frame.height_weights != nullptr) {
-        double* row = work.columns[share].row(work.column_slots.data(), voxel / depth, 4);
+        double* row = work.columns[share].row(
+            work.column_slots.data(), voxel / depth * frame.window_layers() + frame.layer_of(voxel % depth), 4);
         for (int r = 0; r < 4; ++r) row[r] += work.heights.numbers[run * 4 + r];
       }
     }
@@ -311,18 +320,20 @@ int32_t add_hits(const Frame& frame, Workspace& work, const Sums<float>& voxels)
 
 // Combines the heights of the frame with those of the map, as `surface.combine` does.
 void add_heights(const Frame& frame, const Sums<double>& columns) {
-  const int64_t map_columns = frame.map_shape[0] * frame.map_shape[1];
+  const int64_t apart = frame.map_shape[0] * frame.map_shape[1] * frame.map_layers, layers = frame.window_layers();
+  const int32_t lowest = frame.floor_divide(frame.first[2]) - frame.floor_divide(frame.first[2] - frame.corner[2]);
   for (size_t k = 0; k < columns.places.size(); ++k) {
     const double* row = columns.rows.data() + 4 * k;
     if (!(row[1] > 0)) continue;
-    const int32_t x = columns.places[k] / frame.shape[1], y = columns.places[k] % frame.shape[1];
-    float* cell = frame.surface + (frame.corner[0] + x) * frame.map_shape[1] + frame.corner[1] + y;
-    float &count = cell[0], &mass = cell[map_columns], &mean = cell[2 * map_columns], &square = cell[3 * map_columns];
+    const int64_t column = columns.places[k] / layers, layer = columns.places[k] % layers + lowest;
+    const int64_t x = frame.corner[0] + column / frame.shape[1], y = frame.corner[1] + column % frame.shape[1];
+    float* cell = frame.surface + (x * frame.map_shape[1] + y) * frame.map_layers + layer;
+    float &count = cell[0], &mass = cell[apart], &mean = cell[2 * apart], &square = cell[3 * apart];
     const float weight = row[1], height = frame.numbers.camera_z + row[2] / row[1];
     const float scatter = std::max(row[3] - row[2] * row[2] / row[1], 0.0);
-    const float share = weight / std::max(mass + weight, kLeastWeight), apart = height - mean;
-    square += scatter + apart * apart * mass * share;
-    mean += apart * share;
+    const float share = weight / std::max(mass + weight, kLeastWeight), rise = height - mean;
+    square += scatter + rise * rise * (mass * share);
+    mean += rise * share;
     count += float(row[0]);
     mass += weight;
   }
@@ -448,7 +459,7 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, bool carve, int32_t* counte
   const int32_t blocks = int32_t((frame.points + kBlock - 1) / kBlock);
   const int threads = int(std::clamp<int64_t>(pool.num_threads(), 1, kMostThreads));
   work->voxel_slots.resize(std::max<size_t>(work->voxel_slots.size(), columns * depth), 0);
-  work->column_slots.resize(std::max<size_t>(work->column_slots.size(), columns), 0);
+  work->column_slots.resize(std::max<size_t>(work->column_slots.size(), columns * frame.window_layers()), 0);
   work->voxels.resize(std::max<size_t>(work->voxels.size(), threads));
   work->columns.resize(std::max<size_t>(work->columns.size(), threads));
   work->places.of(frame.points);
@@ -490,7 +501,7 @@ ffi::Error fuse_frame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi:
                      ffi::Buffer<ffi::S32> labels, ffi::Buffer<ffi::F32> weights, ffi::Buffer<ffi::F32> height_weights,
                      ffi::Buffer<ffi::F32> measured, ffi::RemainingArgs shares, ffi::Result<ffi::Buffer<ffi::F32>> new_log_odds,
                      ffi::Result<ffi::Buffer<ffi::F32>> new_surface, ffi::Result<ffi::Buffer<ffi::S32>> counted,
-                     ffi::Span<const int64_t> shape, bool carve, int64_t rule) {
+                     ffi::Span<const int64_t> shape, int64_t layer, bool carve, int64_t rule) {
   Frame frame;
   const auto map = log_odds.dimensions();
   frame.classes = int(map[0]) - 1;
@@ -519,6 +530,7 @@ ffi::Error fuse_frame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi:
   frame.weights = weights.typed_data();
   frame.height_weights = height_weights.element_count() ? height_weights.typed_data() : nullptr;
   frame.measured = measured.typed_data();
+  frame.layer = layer, frame.map_layers = surface.dimensions()[3];
   frame.rule = static_cast<Rule>(rule);
   frame.log_odds = new_log_odds->typed_data();
   frame.surface = surface.element_count() ? new_surface->typed_data() : nullptr;
@@ -552,5 +564,6 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxmap_fuse, fuse_frame,
                                   .Ret<ffi::Buffer<ffi::F32>>()
                                   .Ret<ffi::Buffer<ffi::S32>>()
                                   .Attr<ffi::Span<const int64_t>>("shape")
+                                  .Attr<int64_t>("layer")
                                   .Attr<bool>("carve")
                                   .Attr<int64_t>("rule"));

@@ -9,14 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.fusion.query import top_down
-from jaxmap.fusion.surface import Surface, read_surface
+from jaxmap.fusion.query import TopDown
+from jaxmap.fusion.surface import Surface, surface_of
 from jaxmap.geometry.grid import exact_corner
-from jaxmap.planning.hazards import Hazards, Heights, measure_hazards
+from jaxmap.mapping.columns import heights_of, part_of
+from jaxmap.mapping.store import Columns, MapReader
+from jaxmap.planning.hazards import Hazards, Heights, hazard_reach, measure_hazards
 from jaxmap.planning.options import RoverOptions
-from jaxmap.types import GridSpec, VoxelMap
+from jaxmap.types import GridSpec
 
 _REACH_M = 0.1
 """Columns so far around lend their points to far ground, of which there are few."""
@@ -24,8 +25,8 @@ _REACH_M = 0.1
 LEAST_COLUMNS = 1.4
 """Columns in the radius of a rover, at least: a plane needs heights around its middle."""
 
-SURFACE_LAYER, SIGMA_LAYER = "surface_m", "surface_sigma_m"
-"""Names of a map's layers: height of the surface (world z) and its standard deviation; NaN where it is not known."""
+LAYERS = ("surface_m", "surface_sigma_m", *Hazards._fields)
+"""Names of a map's layers: height of the surface (world z), its standard deviation, and hazards; NaN where unknown."""
 
 
 class Ground(NamedTuple):
@@ -42,20 +43,24 @@ class Ground(NamedTuple):
     seen: Bool[np.ndarray, "X Y"]
 
 
-def read_ground(voxel_map: VoxelMap, params: FusionParams, rule: FusionRule, rock: str | None) -> Ground:
-    """The ground of a map.
+def read_ground(reader: MapReader, top: TopDown, params: FusionParams, rock: str | None, within: Columns) -> Ground:
+    """The ground of a rectangle of a map.
 
     Args:
-        voxel_map: the map.
+        reader: the map.
+        top: its top-down map there.
         params: of fusion, by which the evidence is read.
-        rule: of fusion, likewise.
         rock: the class that is no ground to drive on; where it is None, there is none.
+        within: the rectangle.
+
+    Raises:
+        JaxmapError: a tile is damaged, or no memory holds the columns.
     """
-    top = top_down(voxel_map, params, rule)
     probability = np.zeros(top.observed.shape, np.float32)
     if rock is not None:
-        probability = np.asarray(top.probability[voxel_map.classes.index(rock)])
-    surface = read_surface(voxel_map, params, reach=_reach(cell_size(voxel_map.grid)))
+        probability = np.asarray(top.probability[reader.classes.index(rock)])
+    grid = part_of(reader.grid, within)
+    surface = surface_of(heights_of(reader, params, within), grid, reach=_reach(cell_size(grid)))
     return Ground(surface, probability, np.asarray(top.observed))
 
 
@@ -82,22 +87,35 @@ def hazards_of(surface: Surface, cell_m: tuple[float, float], rover: RoverOption
 
 
 def ground_layers(surface: Surface, hazards: Hazards) -> dict[str, Float[np.ndarray, "X Y"]]:
-    """Heights and hazards as the layers of a map, by name; NaN where they are not known."""
+    """Heights and hazards as the layers of a map, by the names of `LAYERS`; NaN where they are not known."""
     height_m, sigma_m, known = map(np.asarray, surface)
-    named = {SURFACE_LAYER: np.where(known, height_m, np.nan), SIGMA_LAYER: np.where(known, sigma_m, np.nan)}
-    return named | {name: np.asarray(values) for name, values in hazards._asdict().items()}
+    heights = (np.where(known, height_m, np.nan), np.where(known, sigma_m, np.nan))
+    return dict(zip(LAYERS, (*heights, *map(np.asarray, hazards)), strict=True))
 
 
-def map_layers(voxel_map: VoxelMap, params: FusionParams) -> dict[str, Float[np.ndarray, "X Y"]]:
-    """The layers of a map's ground: heights that are good to some centimetres, and hazards for the usual rover.
+def keeps_layers(reader: MapReader, rover: RoverOptions) -> bool:
+    """Whether a map keeps heights, and its columns are fine enough for the hazards of a rover."""
+    return reader.surface and rover.radius_m >= LEAST_COLUMNS * max(cell_size(reader.grid))
 
-    None of a map that keeps no heights, or whose columns are too large for hazards.
+
+def map_layers(
+    reader: MapReader, params: FusionParams, rover: RoverOptions, within: Columns
+) -> dict[str, Float[np.ndarray, "X Y"]]:
+    """The layers of a map's ground in a rectangle: heights that are good to some centimetres, and a rover's hazards.
+
+    They are the same through whatever rectangle, which may reach beyond the grid.
+
+    Raises:
+        JaxmapError: the columns are too large for the rover, a tile is damaged, or no memory holds the rectangle.
     """
-    rover, cell_m = RoverOptions(), cell_size(voxel_map.grid)
-    if voxel_map.surface is None or rover.radius_m < LEAST_COLUMNS * max(cell_m):
-        return {}
-    around = read_surface(voxel_map, params, reach=_reach(cell_m))
-    return ground_layers(read_surface(voxel_map, params), hazards_of(around, cell_m, rover))
+    cell_m = cell_size(reader.grid)
+    reach = _reach(cell_m)
+    margin = reach + hazard_reach(cell_m, rover.radius_m, rover.wheel_m)
+    x, y = (slice(side.start - margin, side.stop + margin) for side in within)
+    columns, grid = heights_of(reader, params, (x, y)), part_of(reader.grid, (x, y))
+    hazards = hazards_of(surface_of(columns, grid, reach=reach), cell_m, rover)
+    layers = ground_layers(surface_of(columns, grid), hazards)
+    return {name: values[margin:-margin, margin:-margin] for name, values in layers.items()}
 
 
 def _reach(cell_m: tuple[float, float]) -> int:

@@ -70,6 +70,14 @@ def disc_of(radius_m: float, cell_m: tuple[float, float]) -> Disc:
     return Disc(tuple(zip(i[inside].tolist(), j[inside].tolist(), strict=True)), reach)
 
 
+def hazard_reach(cell_m: tuple[float, float], radius_m: float, gap_m: float) -> int:
+    """Columns to every side on whose heights the hazards of a cell depend."""
+    # To a cell of its disc, from there over a jump, to the middle of a disc that ends there, and to that disc's edge.
+    return max(
+        3 * reach + _gap(gap_m, size) for reach, size in zip(disc_of(radius_m, cell_m).reach, cell_m, strict=True)
+    )
+
+
 @partial(jax.jit, static_argnames=("cell_m", "radius_m", "gap_m", "least_share"))
 def measure_hazards(
     heights: Heights, cell_m: tuple[float, float], radius_m: float, gap_m: float, least_share: float = 0.5
@@ -177,6 +185,10 @@ def _fit_planes(
     return _Planes(height, slope_x, slope_y, n, determinant, noise / count)
 
 
+def _gap(gap_m: float, size_m: float) -> int:
+    return max(1, round(gap_m / size_m))
+
+
 class _Cells(NamedTuple):
     """What a jump is made of: heights and their variances, and the slopes of planes where they are fitted."""
 
@@ -199,7 +211,7 @@ def _jumps(
     gap_m: float,
 ) -> tuple[Array, Array]:
     """The greatest jump from each cell to one a gap away, less its sigma, and its variance; -1 where there is none."""
-    gap = np.array([max(1, round(gap_m / size)) for size in cell_m])
+    gap = np.array([_gap(gap_m, size) for size in cell_m])
     reach = tuple((gap + disc.reach).tolist())
     fields = _Cells(z, variance, known, plane.slope_x, plane.slope_y, fitted)
     pads = _Cells(*(_padded(field, reach, 0) for field in fields))

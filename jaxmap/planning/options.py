@@ -7,7 +7,7 @@ from typing import Annotated
 from annotated_types import Interval
 
 from jaxmap.errors import UsageError
-from jaxmap.host.settings import NotNegative, Positive, options
+from jaxmap.host.settings import NotNegative, Positive, Settings, options
 
 Radius = Annotated[float, Interval(ge=0.02, le=20)]
 
@@ -50,3 +50,6 @@ class RoverOptions:
                 where="rover",
                 fix="take a wheel that is smaller than the rover",
             )
+
+
+ROVER_SETTINGS = Settings(RoverOptions, "plan", folder="rovers")

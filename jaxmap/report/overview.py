@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxmap.ensemble.layer import layer_names, stored_layers
-from jaxmap.export.source import Columns, Source, unknown_top
+from jaxmap.export.source import Source, TopDownPart, unknown_top
 from jaxmap.fusion.query import TopDown
 from jaxmap.report.top_down import missed_picture, top_down_picture
 from jaxmap.types import GridSpec, to_device
@@ -68,7 +68,7 @@ def _ensemble_names(source: Source) -> list[str]:
     return [name for name in names if name in source.reader.attributes.layers]
 
 
-def _add(columns: Columns, step: int, target: int | None, top: Any, layers: dict[str, np.ndarray]) -> None:
+def _add(columns: TopDownPart, step: int, target: int | None, top: Any, layers: dict[str, np.ndarray]) -> None:
     """Adds the columns of a block to the cells that they fall into."""
     x, y = np.argwhere(columns.top.observed).T
     height_m, label = np.asarray(columns.top.height_m)[x, y], np.asarray(columns.top.label)[x, y]

@@ -22,6 +22,8 @@ from jaxmap.types import Pinhole
 
 PICTURE_PX = 640
 """Width of the pictures that are logged."""
+_AHEAD_M, _AWAY_M = 4.0, 5.0
+"""So far before the camera its ground begins to be the map; how much farther than that is wide the eye is away."""
 _SINCE_1970_S = 1e8
 """Smaller times count from some start of their own."""
 _SHOWN = {"left": "Left image", "labels": "Labels", "disparity": "Disparity"}
@@ -95,6 +97,10 @@ class Recording:
             self._stream.log("world/camera/left", pinhole)
         self._stream.log("world/camera/left", encoded)
 
+    def no_left(self) -> None:
+        """From here on there is no left image: an earlier one would stand beside what is of another frame."""
+        self._stream.log("world/camera/left", self._rr.Clear(recursive=False))
+
     def picture(self, kind: str, picture: Path | UInt8[np.ndarray, "H W *rgb"]) -> None:
         """Labels or disparity in colour; `kind` is `labels` or `disparity`."""
         self._stream.log(kind, _encoded(picture)[0])
@@ -122,7 +128,9 @@ class Recording:
 
 
 @contextmanager
-def recording(name: str, classes: Sequence[str], save: Path | None) -> Iterator[Recording]:
+def recording(
+    name: str, classes: Sequence[str], T_world_camera: Float64[np.ndarray, "N 4 4"], save: Path | None
+) -> Iterator[Recording]:
     """A recording that streams into a viewer, which is started, or into a file, which is there when the block ends.
 
     A block that is interrupted (Ctrl-C) leaves a file of what came so far; one that fails leaves none.
@@ -130,22 +138,23 @@ def recording(name: str, classes: Sequence[str], save: Path | None) -> Iterator[
     Args:
         name: of what is shown.
         classes: of the map.
+        T_world_camera: of all frames; at first one sees what they looked at.
         save: the file, or None for a viewer.
 
     Raises:
         JaxmapError: what `check_viewer` refuses, or the file cannot be written.
     """
-    rr = check_viewer(save)
+    rr, layout = check_viewer(save), _layout(T_world_camera)
     if save is None:
         with rr.RecordingStream("jaxmap") as stream:
-            stream.spawn(default_blueprint=_layout())
+            stream.spawn(default_blueprint=layout)
             stream.send_recording_name(name)
             yield Recording(stream, classes)
         return
     stopped = None
     with atomic_path(save) as temporary:
         with rr.RecordingStream("jaxmap") as stream:
-            stream.save(temporary, default_blueprint=_layout())
+            stream.save(temporary, default_blueprint=layout)
             stream.send_recording_name(name)
             try:
                 yield Recording(stream, classes)
@@ -175,14 +184,27 @@ def check_viewer(save: Path | None) -> Any:
     return rr
 
 
-def _layout() -> Any:
-    """The world beside the pictures."""
+def _layout(T_world_camera: Float64[np.ndarray, "N 4 4"]) -> Any:
+    """The world from above the drive, beside the pictures; the time line counts frames, and begins at the last."""
     blueprint = importlib.import_module("rerun.blueprint")
     places = {"left": "world/camera/left", "labels": "labels", "disparity": "disparity"}
     pictures = [blueprint.Spatial2DView(origin=place, name=_SHOWN[kind]) for kind, place in places.items()]
-    world = blueprint.Spatial3DView(origin="world", name="Map")
+    positions, ahead = T_world_camera[:, :3, 3], T_world_camera[:, :3, 2]
+    seen = np.concatenate([positions, positions + _AHEAD_M * ahead])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    middle, away_m = (low + high) / 2, _AWAY_M + float(np.linalg.norm(high - low))
+    eye = blueprint.EyeControls3D(
+        kind=blueprint.Eye3DKind.Orbital,
+        position=middle + away_m * np.array([-0.3, -0.8, 0.8]),
+        look_target=middle,
+        eye_up=[0, 0, 1],
+    )
+    world = blueprint.Spatial3DView(origin="world", name="Map", eye_controls=eye, line_grid=False)
     return blueprint.Blueprint(
-        blueprint.Horizontal(world, blueprint.Vertical(*pictures), column_shares=[2, 1]), collapse_panels=True
+        blueprint.Horizontal(world, blueprint.Vertical(*pictures), column_shares=[2, 1]),
+        blueprint.TimePanel(state="collapsed", timeline="frame", fps=5.0, play_state="following"),
+        blueprint.BlueprintPanel(state="collapsed"),
+        blueprint.SelectionPanel(state="collapsed"),
     )
 
 

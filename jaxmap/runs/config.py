@@ -57,6 +57,8 @@ class MapConfig(PerceiveConfig):
 
     seed: Annotated[int, Seed] = 0
     """Seed of all randomness."""
+    rover: str = "katwijk"
+    """YAML file of the rover whose hazards are layers of the map, or the name of one in configs/rovers (katwijk)."""
     grid: GridOptions = field(default_factory=GridOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
@@ -133,7 +135,7 @@ def config_of_observations(observations: Path, name_or_path: str | None) -> MapC
 def absolute_tree(config: PerceiveConfig) -> dict[str, Any]:
     """A configuration as plain values that mean the same in every folder: for workers."""
     tree = config_tree(config)
-    for name in ("poses", "calibration", "model", "labels"):
+    for name in ("poses", "calibration", "model", "labels", "rover"):
         if tree.get(name) is not None and Path(tree[name]).exists():
             tree[name] = str(Path(tree[name]).absolute())
     return tree

@@ -17,7 +17,7 @@ from jaxmap.datasets.label_raster import DEFAULT_CODING, LabelCoding, LabelRaste
 from jaxmap.datasets.poses import read_poses
 from jaxmap.datasets.rasters import read_picture
 from jaxmap.datasets.rock_list import DEFAULT_DIAMETERS_M, draw_rocks, find_rock_lists, read_rock_lists
-from jaxmap.ensemble.layer import stored_layers
+from jaxmap.ensemble.layer import layer_names, stored_layers
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.camera_track import CameraTrack
 from jaxmap.evaluation.evaluate import ClassLayer, Evaluation, evaluate_map, place_of
@@ -79,8 +79,10 @@ class ScoredMap(NamedTuple):
         grid = part_of(self.reader.grid, within)
         where = (np.asarray(attributes.site_origin, np.float64), attributes.crs)
         layer = _class_layer(top, grid, self.reader.classes, self.params, self.target, *where)
-        ensemble = stored_layers(attributes.layers, self.target, self.path)
-        return layer if ensemble is None else replace(layer, ensemble=np.asarray(ensemble.probability)[within])
+        if not attributes.layers.keys() >= set(layer_names(self.target)):
+            return layer
+        ensemble = stored_layers(self.reader.layers(within), self.target, self.path)
+        return layer if ensemble is None else replace(layer, ensemble=np.asarray(ensemble.probability))
 
 
 def open_scored(run: Path, target: str) -> ScoredMap:

@@ -239,7 +239,7 @@ def _part(cell: Cell, plan: Plan, index: int, prepared: PreparedFrame, added: Co
         weight=np.asarray(added.weight),
         depth_m=np.asarray(added.depth_m),
         left=prepared.rectified.left,
-        disparity_px=prepared.rectified.disparity_px,
+        disparity_px=plan.front_end.disparity_of(prepared.rectified),
     )
 
 

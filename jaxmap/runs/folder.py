@@ -234,6 +234,7 @@ def write_key_frame(
     import cv2
     from PIL import Image
 
+    assert rectified.disparity_px is not None
     pictures = {"left": rectified.left, "disparity": colourise_disparity(rectified.disparity_px)}
     if labels is not None:
         pictures["labels"] = overlay_labels(rectified.left, labels, classes)
@@ -264,8 +265,8 @@ def count_voxels(reader: MapReader, params: FusionParams, rule: FusionRule) -> d
 def count_missed(rule: FusionRule, reader: MapReader, members: int) -> dict[str, Any]:
     """What the ensemble expects the map to have missed; nothing where there is no ensemble."""
     target = rule.target(reader.classes)
-    layers = stored_layers(reader.attributes.layers, target, "map")
-    if layers is None or not members:
+    layers = stored_layers(reader.layers(reader.whole), target, "map") if members else None
+    if layers is None:
         return {}
     missed = np.asarray(layers.missed, np.float64)
     column_m2 = float(np.prod(np.asarray(reader.grid.voxel_size_m, np.float64)[:2]))

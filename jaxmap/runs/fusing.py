@@ -30,6 +30,7 @@ from jaxmap.host.cache import keep_compiled_programs
 from jaxmap.host.executors import Workers, run_tasks
 from jaxmap.mapping.parts import (
     KeptTiles,
+    TileFiles,
     TileRecord,
     assemble_map,
     kept_tiles,
@@ -42,11 +43,11 @@ from jaxmap.mapping.parts import (
 from jaxmap.mapping.regions import Region, Shape, frames_of_tiles, fuse_region, regions_of, tile_sources
 from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import StepReport
-from jaxmap.mapping.store import open_map
-from jaxmap.mapping.tiles import Tile
+from jaxmap.mapping.tile_arrays import Tile
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.config import CHOSEN_ANEW, MapConfig, absolute_tree, check_config
 from jaxmap.runs.folder import RunFolder
+from jaxmap.runs.hazard_layers import add_hazards
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import FrameNumbers, RunLog, numbers_of
 from jaxmap.runs.mapping import Pictures, map_attributes, notes, write_outputs
@@ -268,10 +269,11 @@ def run_shared(
     log.total_s = time.perf_counter() - started_s
     record = TileRecord(work.digest, work.sources, set(), {name: list(told) for name, told in work.told.items()})
     attributes = map_attributes(plan, log)
-    assemble_map(folder.map, plan.grid, plan.labeller.classes, log.fused, attributes, work.files(), record)
+    told = (plan.grid, plan.labeller.classes, log.fused, attributes)
+    assemble_map(folder.map, *told, work.files(), record, surface=plan.rule.surface)
     where = workers.processes if workers.scheduler is None else workers.scheduler
     details = {"shared": {"workers": where, **work.counts}}
-    metrics = write_outputs(plan, folder, log, open_map(folder.map), details)
+    metrics = write_outputs(plan, folder, log, add_hazards(folder.map, plan.rover), details)
     shutil.rmtree(folder.parts, ignore_errors=True)
     if report:
         write_report(folder.path)
@@ -326,7 +328,7 @@ class _Work:
         self.sources = tile_sources(touching, names, self.poses, counted)
         self.kept = KeptTiles({}, set(), {})
         if self.record is not None and self.old is not None:
-            self.kept = kept_tiles(self.old, self.record, self.sources, plan.grid)
+            self.kept = kept_tiles(self.old, self.record, self.sources, plan.grid, surface=plan.rule.surface)
             of_old = {name: FrameNumbers(*told) for name, told in self.record.frames.items()}
             self.told = of_old | self.told
         for tile, reason in self.kept.lost.items():
@@ -364,7 +366,7 @@ class _Work:
             if not (place := self.part_of(region)).exists()
         ]
 
-    def files(self) -> dict[Tile, Path]:
+    def files(self) -> TileFiles:
         """The files of all tiles, once all are there."""
         files = dict(self.kept.files)
         for region in self.regions:
@@ -416,7 +418,7 @@ def _digest(plan: Plan, config: MapConfig) -> str:
     """A fingerprint of all that decides what a tile comes out as but its frames and their poses."""
     assert plan.observations is not None
     # Bounds and memory decide which tiles there are, not what they hold; their voxels are compared apart.
-    free = ("sequence", "grid", *CHOSEN_ANEW, *_FILES)
+    free = ("sequence", "grid", "rover", *CHOSEN_ANEW, *_FILES)
     settings = {name: value for name, value in plan.settings(config).items() if name not in free}
     told = [settings, plan.observations.attributes.digest(), plan.depth_range_m, plan.fusion, plan.labeller.classes]
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]

@@ -81,7 +81,9 @@ def numbers_of(prepared: PreparedFrame, info: StepReport) -> FrameNumbers:
     rectified = prepared.rectified
     pixels, too_near, nearest_px = 1, 0.0, 0.0
     if rectified is not None:
-        pixels, too_near, nearest_px = rectified.disparity_px.size, rectified.too_near, rectified.nearest_px
+        seen = rectified.left if rectified.disparity_px is None else rectified.disparity_px
+        height, width = seen.shape[:2]
+        pixels, too_near, nearest_px = height * width, rectified.too_near, rectified.nearest_px
     # Of the plane labeller as of those that see relief.
     found = getattr(info.estimate, "found", None)
     return FrameNumbers(

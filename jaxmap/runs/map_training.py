@@ -123,7 +123,7 @@ class MapTrainingData:
         frames = [kept.frame for kept in chosen]
         return FrameBatch(
             np.stack([np.asarray(frame.image) for frame in frames]),  # type: ignore[arg-type]
-            np.stack([np.asarray(frame.disparity_px) for frame in frames]),  # type: ignore[arg-type]
+            np.stack([np.asarray(frame.matched_px) for frame in frames]),  # type: ignore[arg-type]
             np.stack([np.asarray(frame.T_world_camera.wxyz_xyz) for frame in frames]),  # type: ignore[arg-type]
             np.stack([kept.anchors for kept in chosen]),  # type: ignore[arg-type]
             draws,  # type: ignore[arg-type]
@@ -409,7 +409,7 @@ def prepare_training_frames(
         if prepared.frame is None or prepared.rectified is None:
             notify(f"skipped: {prepared.fault}")
             continue
-        anchors = np.full(prepared.frame.disparity_px.shape, IGNORE, np.uint8)
+        anchors = np.full(prepared.frame.matched_px.shape, IGNORE, np.uint8)
         if network is not None:
             labels = network.logits(prepared.rectified.left).argmax(axis=-1)
             anchors = np.where(np.isin(labels, hidden), labels, SHOWN).astype(np.uint8)
@@ -421,8 +421,8 @@ def prepare_training_frames(
 def cells_of_pixels(frame: Frame, plan: Plan, truth: CellTruth) -> UInt8[np.ndarray, "H W"]:
     """The class of the cell that each pixel's point lies in, or `IGNORE`."""
     sigma_px = plan.params.fusion.disparity_sigma_px
-    cloud = project(plan.front_end.camera, frame.T_world_camera, frame.disparity_px, plan.depth_range_m, sigma_px)
-    points_world = np.asarray(cloud.points_world).reshape(*frame.disparity_px.shape, 3)
+    cloud = project(plan.front_end.camera, frame.T_world_camera, frame.matched_px, plan.depth_range_m, sigma_px)
+    points_world = np.asarray(cloud.points_world).reshape(*frame.matched_px.shape, 3)
     return np.where(np.asarray(cloud.in_range), truth.of_points(points_world), np.uint8(IGNORE))
 
 

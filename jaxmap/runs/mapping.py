@@ -22,16 +22,17 @@ from jaxmap.mapping.devices import Device, choose_devices, run_on_devices
 from jaxmap.mapping.sequence import FusedFrame, PreparedFrame
 from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import MovingBlock, TileStore
-from jaxmap.planning.ground import map_layers
+from jaxmap.planning.ground import keeps_layers, map_layers
 from jaxmap.profiling.step_profile import WARM_UP_FRAMES, StepProfile, table_lines
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.checking import finding_line, findings_tree
 from jaxmap.runs.exports import write_exports
 from jaxmap.runs.folder import RunFolder, count_missed, count_voxels, write_key_frame, write_poses
+from jaxmap.runs.hazard_layers import add_hazards
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import RunLog
 from jaxmap.runs.mapping_plan import Plan
-from jaxmap.runs.run_frames import write_frame_table
+from jaxmap.runs.run_frames import rows_of, write_frame_table
 from jaxmap.types import VoxelMap
 
 _PICTURES_AT_ONCE = 4
@@ -181,7 +182,8 @@ class _TiledMap:
     def __init__(self, plan: Plan, path: Path) -> None:
         assert plan.block_shape is not None
         self.plan, self.path = plan, path
-        self.block = MovingBlock(TileStore(path, plan.grid, plan.labeller.classes), plan.block_shape)
+        store = TileStore(path, plan.grid, plan.labeller.classes, surface=plan.rule.surface)
+        self.block = MovingBlock(store, plan.block_shape)
         poses = plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified
         self.boxes = view_boxes(plan.grid, plan.front_end.camera, poses, plan.depth_range_m[1])
 
@@ -206,7 +208,7 @@ class _TiledMap:
         """Writes the map for good, and opens it, which lists its tiles: seconds where they are many."""
         self.save(voxel_map, attributes)
         self.block.store.close()
-        return open_map(self.path)
+        return add_hazards(self.path, self.plan.rover)
 
 
 def _save(plan: Plan, log: RunLog, memory: _WholeMap | _TiledMap, voxel_map: VoxelMap, pictures: Pictures) -> None:
@@ -227,14 +229,15 @@ def _disparity_scores(plan: Plan, fused: FusedFrame) -> DisparityScores | None:
     truth_px = read(ref)
     if truth_px is None:
         return None
-    if truth_px.shape != rectified.disparity_px.shape:
-        size, expected = (f"{shape[1]}x{shape[0]}" for shape in (truth_px.shape, rectified.disparity_px.shape))
+    disparity_px = plan.front_end.disparity_of(rectified)
+    if truth_px.shape != disparity_px.shape:
+        size, expected = (f"{shape[1]}x{shape[0]}" for shape in (truth_px.shape, disparity_px.shape))
         raise JaxmapError(
             f"the true disparity is {size} px, the image {expected} px",
             where=f"frame {ref.name}",
             fix="give the truth of this image, or remove it",
         )
-    return score_disparity(rectified.disparity_px, truth_px)
+    return score_disparity(disparity_px, truth_px)
 
 
 def notes(plan: Plan, log: RunLog, metrics: dict[str, Any]) -> Iterator[str]:
@@ -277,7 +280,7 @@ def write_outputs(
     write_poses(
         folder, timestamps_s[fused_frames], plan.sequence.T_world_camera[fused_frames], plan.sequence.site_origin
     )
-    write_frame_table(folder.frames, plan.sequence.frames, skipped)
+    write_frame_table(folder.frames, rows_of(plan.sequence.frames, skipped))
     write_exports(folder, reader)
     metrics = _metrics(plan, log, reader) | count_missed(plan.rule, reader, plan.members) | details
     write_json(folder.metrics, metrics)
@@ -325,10 +328,7 @@ def map_attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap | None = None) -
     """What is stored beside the map, which is looked at where it has an ensemble."""
     log.digest = plan.digest(log.next_index)
     layers = {} if voxel_map is None else named_layers(voxel_map, plan.params.fusion, plan.rule)
-    # Of a part of a larger map, the layers would be no map's.
-    if log.complete and plan.block_shape is None and voxel_map is not None:
-        layers |= map_layers(voxel_map, plan.params.fusion)
-    return MapAttributes(
+    attributes = MapAttributes(
         crs=plan.sequence.crs,
         site_origin=plan.sequence.site_origin,
         T_world_source=plan.sequence.T_world_source,
@@ -336,6 +336,12 @@ def map_attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap | None = None) -
         progress=log.as_json(),
         layers=layers,
     )
+    # Those of a part of a larger map would be no map's (`add_hazards`).
+    if log.complete and plan.block_shape is None and voxel_map is not None:
+        reader = in_memory(voxel_map, attributes)
+        if keeps_layers(reader, plan.rover):
+            layers |= map_layers(reader, plan.params.fusion, plan.rover, reader.whole)
+    return attributes
 
 
 class Pictures:
@@ -363,11 +369,11 @@ class Pictures:
         plan = self.plan
         for prepared, number in self.waiting:
             assert prepared.frame is not None and prepared.rectified is not None
-            labels = None
+            rectified, labels = plan.front_end.matched(prepared.rectified), None
             if plan.labeller.classes:
                 labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
             large = plan.key_frames[prepared.index]
-            write_key_frame(self.folder, prepared.index, prepared.rectified, labels, plan.labeller.classes, large=large)
+            write_key_frame(self.folder, prepared.index, rectified, labels, plan.labeller.classes, large=large)
         self.waiting.clear()
 
 

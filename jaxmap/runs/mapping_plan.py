@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,17 +21,18 @@ from jaxmap.fusion.params import fusion_attribute, make_fusion_params
 from jaxmap.geometry.bounds import check_memory, grid_around_views, map_bytes, site_lattice, usable_depth, view_boxes
 from jaxmap.geometry.grid import window_shape
 from jaxmap.geometry.options import GridOptions, Triple
-from jaxmap.labellers.base import Labeller
 from jaxmap.mapping.observations import Observations
 from jaxmap.mapping.regions import frames_of_tiles, region_shape
 from jaxmap.mapping.sequence import PreparedFrame, frame_form, observed_frames, prepare_frames
 from jaxmap.mapping.step import Mapper, MapperParams, make_mapper
-from jaxmap.mapping.tiles import block_shape, whole_tiles
+from jaxmap.mapping.tiles import block_shape, channels_of, whole_tiles
+from jaxmap.planning.options import ROVER_SETTINGS, RoverOptions
 from jaxmap.runs.config import MapConfig, PerceiveConfig
 from jaxmap.runs.labelling import Notify, as_usage_error
 from jaxmap.runs.perceiving import Keeper, make_keeper
 from jaxmap.runs.perception import Perception, plan_perception, saw_relief
 from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.jax_matcher import JaxMatcher
 from jaxmap.types import MAX_TENSOR_ELEMENTS, Frame, GridSpec, StereoCamera, make_grid
 
 DEFAULT_VOXEL_M: Triple = (0.05, 0.05, 0.2)
@@ -118,6 +119,7 @@ class Plan(Perception):
     Attributes:
         keeper: keeps what is perceived on the way, where that was asked for.
         pose_errors: of the members of an ensemble, for each frame.
+        rover: whose hazards are layers of the map.
         block_shape: of a map that is larger than the memory it may take, or shared out: voxels along each axis of the
             part that is in memory.
     """
@@ -132,6 +134,7 @@ class Plan(Perception):
     keeper: Keeper | None = None
     pose_errors: Float[np.ndarray, "N M 6"] | None = None
     block_shape: tuple[int, int, int] | None = None
+    rover: RoverOptions = field(default_factory=RoverOptions)
 
     @property
     def members(self) -> int:
@@ -143,7 +146,8 @@ class Plan(Perception):
         """The form of the frames that the step takes."""
         kept = self.observations or self.keeper
         shape = () if kept is None else kept.attributes.kept_shape
-        return frame_form(self.front_end.camera, self.labeller, self.members, shape)
+        matched = self.mapper.design.match is None
+        return frame_form(self.front_end.camera, self.labeller, self.members, shape, matched=matched)
 
     def prepare(self, indices: Sequence[int] | None = None, keep_in: Path | None = None) -> Iterator[PreparedFrame]:
         """Frames, made ready ahead of their use.
@@ -163,6 +167,7 @@ class Plan(Perception):
             self.front_end,
             self.label_folder,
             needs=self.labeller.needs,
+            matched=self.mapper.design.match is None,
             pose_errors=self.pose_errors,
             indices=indices,
         )
@@ -190,6 +195,7 @@ def plan_run(
     *,
     keep: bool = False,
     images: bool = False,
+    match_in_step: bool = False,
     in_tiles: bool = False,
     shared: Sharing | tuple[int, int, int] | None = None,
 ) -> Plan:
@@ -202,6 +208,9 @@ def plan_run(
         on_frame: is told of the progress of odometry, where it gives the poses.
         keep: keep what is perceived, as observations.
         images: of observations, too, let the labeller see the images (`plan_perception`).
+        match_in_step: the step itself matches, where the settings name a matcher in JAX and nothing else wants the
+            disparity of every frame: it is neither kept nor compared with a truth. Otherwise frames are matched
+            ahead, by the same function, compiled apart.
         in_tiles: a map that takes more memory than it may is kept in tiles, not refused.
         shared: fuse regions of the map apart, one at a time on each worker; or the shape of a region.
 
@@ -225,13 +234,18 @@ def plan_run(
     # The members of an ensemble stand elsewhere.
     T_known = None if members else sequence.T_world_camera @ front_end.T_raw_rectified
     window = window_shape(grid, camera, depth_range_m[1], T_known)
-    tiled = in_tiles and not members
+    channels = channels_of(len(labeller.classes), surface=rule.surface)
     if shared is not None:
-        grid, block = _in_regions(grid, camera, labeller, depth_range_m[1], T_known, shared)
+        grid, block = _in_regions(grid, camera, channels, depth_range_m[1], T_known, shared)
     else:
-        grid, block = _fit_memory(grid, window, len(labeller.classes), members, config.grid.max_memory_gib, tiled=tiled)
+        in_blocks = channels if in_tiles and not members else None
+        limit_gib = config.grid.max_memory_gib
+        grid, block = _fit_memory(grid, window, len(labeller.classes), members, limit_gib, in_blocks)
     held = ("fused at a time",) if shared else ()
     notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block, *held))
+    match = None
+    if match_in_step and keeper is None and seen.observations is None and sequence.true_disparity is None:
+        match = front_end.matcher if isinstance(front_end.matcher, JaxMatcher) else None
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
     if members:
@@ -244,7 +258,7 @@ def plan_run(
         grid=grid,
         depth_range_m=depth_range_m,
         rule=rule,
-        params=MapperParams(camera, fusion_params, labeller.params, ensemble),
+        params=MapperParams(camera, fusion_params, labeller.params, ensemble, match and match.params),
         fusion=fusion_attribute(config.fusion, rule) | ({"ensemble": asdict(config.ensemble)} if members else {}),
         mapper=make_mapper(
             camera,
@@ -253,25 +267,34 @@ def plan_run(
             rule,
             depth_range_m,
             members=members,
+            match=match and match.design,
             T_world_camera=T_known,
         ),
         key=key,
         pose_errors=pose_errors,
         block_shape=block,
+        rover=ROVER_SETTINGS.load(config.rover),
     )
 
 
 def _fit_memory(
-    grid: GridSpec, window: tuple[int, int, int], class_count: int, members: int, limit_gib: float, *, tiled: bool
+    grid: GridSpec,
+    window: tuple[int, int, int],
+    class_count: int,
+    members: int,
+    limit_gib: float,
+    channels: float | None,
 ) -> tuple[GridSpec, tuple[int, int, int] | None]:
     """The grid and, where it is kept in tiles, voxels along each axis of the block that is in memory.
+
+    That has so many `channels`; where they are None it may not be in tiles.
 
     Raises:
         JaxmapError: it takes more memory than it may, or would even in tiles.
     """
     limit_bytes = min(limit_gib * 2**30, 4 * MAX_TENSOR_ELEMENTS)
-    if tiled and map_bytes(grid, class_count) > limit_bytes:
-        block = block_shape(whole_tiles(grid), window, 1 + class_count, limit_bytes)
+    if channels is not None and map_bytes(grid, class_count) > limit_bytes:
+        block = block_shape(whole_tiles(grid), window, channels, limit_bytes)
         if block is not None:
             return whole_tiles(grid), block
     check_memory(grid, class_count, limit_gib, members)
@@ -281,7 +304,7 @@ def _fit_memory(
 def _in_regions(
     grid: GridSpec,
     camera: StereoCamera,
-    labeller: Labeller,
+    channels: float,
     max_depth_m: float,
     T_known: Float[np.ndarray, "N 4 4"] | None,
     shared: Sharing | tuple[int, int, int],
@@ -298,7 +321,7 @@ def _in_regions(
         return grid, shared
     touching = frames_of_tiles(grid, view_boxes(grid, camera, T_known, max_depth_m))
     window, limit_bytes = window_shape(grid, camera, max_depth_m, T_known), shared.memory_gib * 2**30
-    shape = region_shape(grid, window, 1 + len(labeller.classes), limit_bytes, touching, shared.workers)
+    shape = region_shape(grid, window, channels, limit_bytes, touching, shared.workers)
     if shape is None:
         raise UsageError(
             f"what one frame sees takes more than the {shared.memory_gib:.3g} GiB that each worker may",

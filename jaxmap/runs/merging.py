@@ -22,9 +22,12 @@ from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.merge import add_maps, check_alike, common_grid, digests_of
 from jaxmap.mapping.store import MapReader, open_map
 from jaxmap.mapping.tiles import TileStore
+from jaxmap.planning.options import RoverOptions
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.exports import write_exports
 from jaxmap.runs.folder import RunFolder, count_voxels, write_poses
+from jaxmap.runs.hazard_layers import add_hazards
+from jaxmap.runs.run_frames import FrameRow, read_frame_table, write_frame_table
 
 _PICTURE = re.compile(r"(?P<frame>\d{6})_(?P<kind>left|disparity|labels)\.(?P<ending>png|webp)")
 _PAUSE_S = 1.0
@@ -46,6 +49,11 @@ class Session:
     reader: MapReader
     metrics: dict[str, Any]
     track: PoseTrack | None
+
+    @property
+    def name(self) -> str:
+        """That of its sequence, or of its folder."""
+        return str(self.group("sequence").get("name") or self.folder.path.name)
 
     def group(self, name: str) -> dict[str, Any]:
         """A group of metrics; empty where it is absent or no group."""
@@ -92,13 +100,17 @@ def settings_of(sessions: Sequence[Session]) -> dict[str, Any]:
 
 
 def merge_sessions(
-    sessions: Sequence[Session], folder: RunFolder, on_block: Callable[[int], object] = lambda done: None
+    sessions: Sequence[Session],
+    folder: RunFolder,
+    rover: RoverOptions,
+    on_block: Callable[[int], object] = lambda done: None,
 ) -> list[str]:
     """Writes the run that all sessions make.
 
     Args:
         sessions: of `open_sessions`.
         folder: where it goes; `RunFolder.begin` was called.
+        rover: whose hazards are layers of the map.
         on_block: is told how many blocks of the maps were added.
 
     Returns:
@@ -107,34 +119,38 @@ def merge_sessions(
     Raises:
         JaxmapError: a map is damaged, the lattices do not agree, or an output cannot be written.
     """
-    _write_map(sessions, folder, on_block)
+    _write_map(sessions, folder, rover, on_block)
     reader = open_map(folder.map)
-    notes = _write_poses(sessions, folder)
+    firsts = np.cumsum([0, *map(_count, sessions)])[:-1].tolist()
+    notes = _write_poses(sessions, firsts, folder)
     if reader.attributes.crs is None:
         notes.append("no run has a CRS: their worlds are taken for one and the same")
-    first, key_frames = 0, {}
-    for session in sessions:
+    key_frames = {}
+    for session, first in zip(sessions, firsts, strict=True):
         key_frames |= _take_key_frames(session, folder, first, reader.attributes.site_origin)
-        first += _count(session)
     write_exports(folder, reader)
     write_json(folder.metrics, _metrics(sessions, reader, key_frames, notes))
     write_report(folder.path)
     return notes
 
 
-def _write_map(sessions: Sequence[Session], folder: RunFolder, on_block: Callable[[int], object]) -> None:
+def _write_map(
+    sessions: Sequence[Session], folder: RunFolder, rover: RoverOptions, on_block: Callable[[int], object]
+) -> None:
     """The map is made in a folder of its own, and put in its place when it is whole."""
     readers = [session.reader for session in sessions]
     grid, shifts = common_grid(readers, [session.folder.path for session in sessions])
     making = folder.path / ".merging"
     try:
         shutil.rmtree(making, ignore_errors=True)
-        store = TileStore(making / folder.map.name, grid, readers[0].classes)
+        surface = all(reader.surface for reader in readers)
+        store = TileStore(making / folder.map.name, grid, readers[0].classes, surface=surface)
         add_maps(readers, shifts, store, on_block)
         digests = [digest for reader in readers for digest in digests_of(reader)]
         attributes = replace(readers[0].attributes, layers={}, progress={"complete": True, "digests": digests})
         store.commit(sum(reader.frames_fused for reader in readers), attributes)
         store.close()
+        add_hazards(making / folder.map.name, rover)
         os.rename(making / folder.map.name, folder.map)
         sync(folder.path)
     except OSError as error:
@@ -143,16 +159,19 @@ def _write_map(sessions: Sequence[Session], folder: RunFolder, on_block: Callabl
         shutil.rmtree(making, ignore_errors=True)
 
 
-def _write_poses(sessions: Sequence[Session], folder: RunFolder) -> list[str]:
-    """Writes the poses of all sessions, in the order of their times; what was moved for that is told."""
+def _write_poses(sessions: Sequence[Session], firsts: Sequence[int], folder: RunFolder) -> list[str]:
+    """Writes the poses and the frames of all sessions, in the order of their times; what was moved for that is told.
+
+    Frames keep their numbers within their session, which go on from `firsts`.
+    """
     notes = [f"{one.folder.path} has no poses.tum: its path is left out" for one in sessions if one.track is None]
-    tracks = [(session, session.track) for session in sessions if session.track is not None]
+    tracks = [(one, first, one.track) for one, first in zip(sessions, firsts, strict=True) if one.track is not None]
     if not tracks:
         return notes
-    times, poses = [], []
+    times, poses, rows = [], [], []
     last_s = -np.inf
-    for session, track in sorted(tracks, key=lambda pair: _times_s(pair[1])[0]):
-        times_s = _times_s(track)
+    for session, first, track in sorted(tracks, key=lambda one: _times_s(one[2])[0]):
+        times_s, later_s = _times_s(track), 0.0
         if times_s[0] <= last_s:
             later_s = float(last_s + _PAUSE_S - times_s[0])
             told = f"the times of {session.folder.path} overlap with another run's"
@@ -160,9 +179,15 @@ def _write_poses(sessions: Sequence[Session], folder: RunFolder) -> list[str]:
             times_s = times_s + later_s
         times.append(times_s)
         poses.append(track.T)
+        rows += [
+            FrameRow(row.frame + first, f"{session.name}/{row.name}", row.timestamp_s + later_s, row.skipped)
+            for row in read_frame_table(session.folder, len(times_s))
+            or [FrameRow(i, f"{i:06d}", float(time_s) - later_s) for i, time_s in enumerate(times_s)]
+        ]
         last_s = times_s[-1]
     # They are absolute already.
     write_poses(folder, np.concatenate(times), np.concatenate(poses), np.zeros(3))
+    write_frame_table(folder.frames, rows)
     return notes
 
 
@@ -201,10 +226,7 @@ def _metrics(
     """What metrics.json holds: sums over the sessions, and what they have in common."""
     params, rule = stored_fusion(reader.attributes.fusion, reader.classes, "the map")
     sequences = [session.group("sequence") for session in sessions]
-    names = [
-        str(sequence.get("name") or session.folder.path.name)
-        for sequence, session in zip(sequences, sessions, strict=True)
-    ]
+    names = [session.name for session in sessions]
     cameras = [
         {key: value for key, value in session.group("camera").items() if key != "key_frames"} for session in sessions
     ]

@@ -160,7 +160,7 @@ class Keeper:
             prepared.ref.name,
             prepared.ref.timestamp_s,
             self.seen.sequence.T_world_camera[index],
-            rectified.disparity_px,
+            self.seen.front_end.disparity_of(rectified),
             None if values is None else np.asarray(values),
             rectified.too_near,
             rectified.nearest_px,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,22 +17,21 @@ from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.export.geotiff import write_bands
 from jaxmap.export.route import write_csv, write_geojson
 from jaxmap.export.source import absolute
-from jaxmap.fusion.params import stored_fusion
-from jaxmap.fusion.query import top_down
+from jaxmap.fusion.options import FusionRule
+from jaxmap.fusion.params import FusionParams, stored_fusion
+from jaxmap.fusion.query import TopDown
 from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.output_folder import write_json
-from jaxmap.host.settings import Settings
-from jaxmap.mapping.store import MapAttributes, load_map
+from jaxmap.mapping.columns import MOST_WHOLE, part_of, top_down_of
+from jaxmap.mapping.store import Columns, MapAttributes, MapReader, open_map
 from jaxmap.planning.cost import CostMap, cost_map
 from jaxmap.planning.ground import Ground, cell_size, ground_layers, hazards_of, read_ground
 from jaxmap.planning.hazards import Hazards
-from jaxmap.planning.options import RoverOptions
+from jaxmap.planning.options import ROVER_SETTINGS, RoverOptions
 from jaxmap.planning.path import NoPathError, Terrain, find_path, length_m, sampled, straightened
 from jaxmap.report.plan_picture import write_plan_picture
 from jaxmap.runs.folder import RunFolder
-from jaxmap.types import VoxelMap
-
-ROVER_SETTINGS = Settings(RoverOptions, "plan", folder="rovers")
+from jaxmap.types import GridSpec
 
 PLAN_FILES = ("plan.png", "plan.geojson", "plan.csv", "plan.tif", "plan.json")
 ROCK = 0.5
@@ -40,28 +40,43 @@ _SAMPLE_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
+class Site:
+    """The part of a map that is planned over; arrays are on the host.
+
+    Attributes:
+        grid: of the part.
+        top: its top-down map.
+        attributes: of the whole map.
+        rock: name of the class that is rock, None where the map has none.
+        fine: whether heights are finer than voxels.
+    """
+
+    grid: GridSpec
+    top: TopDown
+    attributes: MapAttributes
+    rock: str | None
+    fine: bool
+
+
+@dataclass(frozen=True, eq=False)
 class Costs:
     """A run's ground, and what driving it costs a rover; arrays are on the host.
 
     Attributes:
+        site: where it is.
         terrain: what paths are sought over.
         ground: as the map has it.
         hazards: for the rover.
         costs: for the rover.
         rover: the rover.
-        voxel_map: the map.
-        attributes: of the map.
-        rock: name of the class that is rock, None where the map has none.
     """
 
+    site: Site
     terrain: Terrain
     ground: Ground
     hazards: Hazards
     costs: CostMap
     rover: RoverOptions
-    voxel_map: VoxelMap
-    attributes: MapAttributes
-    rock: str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,30 +97,43 @@ class Plan:
 
 
 def read_costs(run: Path, rover: RoverOptions) -> Costs:
-    """What driving over the map of a run costs a rover.
+    """What driving over the map of a run costs a rover; of a large map, over the rectangle that was observed.
 
     Raises:
-        JaxmapError: there is no map, it is damaged, or too coarse for the rover.
+        JaxmapError: there is no map, it is damaged, too coarse for the rover, or no memory holds the rectangle.
     """
     folder = RunFolder(run)
     if not run.is_dir():
         raise JaxmapError("no such run folder", where=run, fix="give a folder that `jaxmap map` wrote")
-    voxel_map, attributes = load_map(folder.map)
-    params, rule = stored_fusion(attributes.fusion, voxel_map.classes, folder.map)
-    rock = rule.target(voxel_map.classes)
-    return costs_of(voxel_map, attributes, read_ground(voxel_map, params, rule, rock), rover, rock)
+    reader = open_map(folder.map)
+    within = reader.whole if math.prod(reader.grid.shape[:2]) <= MOST_WHOLE else reader.extent()
+    params, rule = stored_fusion(reader.attributes.fusion, reader.classes, folder.map)
+    return costs_of(*read_site(reader, params, rule, within), rover)
 
 
-def costs_of(
-    voxel_map: VoxelMap, attributes: MapAttributes, ground: Ground, rover: RoverOptions, rock: str | None
-) -> Costs:
-    """`read_costs` of a ground."""
-    cell_m = cell_size(voxel_map.grid)
+def read_site(reader: MapReader, params: FusionParams, rule: FusionRule, within: Columns) -> tuple[Site, Ground]:
+    """A rectangle of a map, and its ground.
+
+    Raises:
+        JaxmapError: a tile is damaged, or no memory holds the rectangle.
+    """
+    top, rock = top_down_of(reader, params, rule, within), rule.target(reader.classes)
+    site = Site(part_of(reader.grid, within), top, reader.attributes, rock, reader.surface)
+    return site, read_ground(reader, top, params, rock, within)
+
+
+def costs_of(site: Site, ground: Ground, rover: RoverOptions) -> Costs:
+    """What driving over a ground costs a rover.
+
+    Raises:
+        JaxmapError: the cells are too large for it.
+    """
+    cell_m = cell_size(site.grid)
     hazards = hazards_of(ground.surface, cell_m, rover)
     costs = cost_map(hazards, ground.rock_probability, ground.seen, cell_m, rover)
     hazards, costs, ground = jax.tree.map(np.asarray, (hazards, costs, ground))
-    terrain = Terrain(costs.cost, costs.drivable, exact_corner(voxel_map.grid)[0][:2], np.array(cell_m))
-    return Costs(terrain, ground, hazards, costs, rover, voxel_map, attributes, rock)
+    terrain = Terrain(costs.cost, costs.drivable, exact_corner(site.grid)[0][:2], np.array(cell_m))
+    return Costs(site, terrain, ground, hazards, costs, rover)
 
 
 def plan_path(costs: Costs, start: Float[np.ndarray, "2"], goal: Float[np.ndarray, "2"]) -> Plan:
@@ -115,7 +143,7 @@ def plan_path(costs: Costs, start: Float[np.ndarray, "2"], goal: Float[np.ndarra
         UsageError: one of them is outside the map, or where the rover cannot be; it names the nearest free place.
         JaxmapError: the goal cannot be reached.
     """
-    terrain, site = costs.terrain, costs.attributes.site_origin[:2]
+    terrain, site = costs.terrain, costs.site.attributes.site_origin[:2]
     cells = [_free_cell(costs, name, place) for name, place in (("start", start), ("goal", goal))]
     try:
         steps, _ = find_path(terrain, *cells)
@@ -139,10 +167,8 @@ def write_plan(costs: Costs, plan: Plan, folder: Path) -> None:
         JaxmapError: the disk is full or refuses.
     """
     picture, geojson, table, raster, metrics = (folder / name for name in PLAN_FILES)
-    attributes, grid = costs.attributes, costs.voxel_map.grid
+    attributes, grid, top = costs.site.attributes, costs.site.grid, costs.site.top
     folder.mkdir(parents=True, exist_ok=True)
-    params, rule = stored_fusion(attributes.fusion, costs.voxel_map.classes, "map")
-    top = jax.tree.map(np.asarray, top_down(costs.voxel_map, params, rule))
     placed = attributes.crs is not None
     write_plan_picture(picture, costs.costs, costs.ground, top, grid, plan.points_m, plan.metrics, georeferenced=placed)
     write_geojson(geojson, plan.points_m + attributes.site_origin[:2], attributes.crs, plan.metrics)
@@ -159,7 +185,7 @@ def _free_cell(costs: Costs, name: str, place: Float[np.ndarray, "2"]) -> Int[np
     Raises:
         UsageError: it cannot be there.
     """
-    terrain, site = costs.terrain, costs.attributes.site_origin[:2]
+    terrain, site = costs.terrain, costs.site.attributes.site_origin[:2]
     free = terrain.drivable & (costs.costs.rock <= ROCK)
     cell = terrain.cell_of(place - site)
     reason = _why_not(costs, cell) if terrain.holds(cell) else "lies outside the map"
@@ -186,7 +212,7 @@ def _why_not(costs: Costs, cell: Int[np.ndarray, "2"]) -> str:
 def _along(costs: Costs, places_m: Float[np.ndarray, "S 2"]) -> dict[str, Float[np.ndarray, "S"]]:
     """The numbers of the places along a path."""
     i, j = costs.terrain.cell_of(places_m).T
-    site, surface, hazards = costs.attributes.site_origin, costs.ground.surface, costs.hazards
+    site, surface, hazards = costs.site.attributes.site_origin, costs.ground.surface, costs.hazards
     steps_m = np.linalg.norm(np.diff(places_m, axis=0), axis=1)
     east, north = (places_m + site[:2]).T
     height_m = np.where(surface.known, np.asarray(surface.height_m, np.float64) + site[2], np.nan)
@@ -230,8 +256,8 @@ def _metrics(
         "unknown_share": round(float(along["unknown"].mean()), 4),
         "start": np.round(ends[0], 3).tolist(),
         "goal": np.round(ends[1], 3).tolist(),
-        "crs": costs.attributes.crs,
-        "rock_class": costs.rock,
+        "crs": costs.site.attributes.crs,
+        "rock_class": costs.site.rock,
         "rover": ROVER_SETTINGS.tree(costs.rover),
         "jaxmap_version": jaxmap.__version__,
     }

@@ -236,7 +236,7 @@ def read_inputs(
             rectified = front_end(pair.left, pair.right)
             if index == 0:
                 front_end.check_order(rectified, f"frame {frame.name}")
-            made = make_disparity_frame(rectified.left, rectified.disparity_px)
+            made = make_disparity_frame(rectified.left, front_end.disparity_of(rectified))
             return made or FrameError("hardly any pixel has a disparity", fix="check the images")
         except FrameError as fault:
             return fault

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int
@@ -20,7 +20,14 @@ from jaxmap.host.files import atomic_path
 from jaxmap.runs.folder import RunFolder
 from jaxmap.types import Pinhole
 
-_COLUMNS = ("frame", "name", "timestamp_s", "skipped")
+
+class FrameRow(NamedTuple):
+    """A row of `frames.csv`: index and name of a frame, its time, and why it was skipped (empty where it was fused)."""
+
+    frame: int
+    name: str
+    timestamp_s: float
+    skipped: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +55,36 @@ class RunFrames:
     notes: tuple[str, ...]
 
 
-def write_frame_table(path: Path, frames: Sequence[FrameRef], skipped: Mapping[str, str]) -> None:
-    """Writes `frames.csv`: index, name and time of each frame, and why it was skipped (empty where it was fused).
+def rows_of(frames: Sequence[FrameRef], skipped: Mapping[str, str]) -> list[FrameRow]:
+    """The table of a sequence, of which some frames were skipped: the reasons, by their names."""
+    return [
+        FrameRow(i, frame.name, float(frame.timestamp_s), skipped.get(frame.name, "")) for i, frame in enumerate(frames)
+    ]
+
+
+def write_frame_table(path: Path, rows: Iterable[FrameRow]) -> None:
+    """Writes `frames.csv`, whose rows that are not skipped are those of `poses.tum`.
 
     Raises:
         JaxmapError: the disk is full or refuses.
     """
-    rows = [
-        (i, frame.name, repr(float(frame.timestamp_s)), skipped.get(frame.name, "")) for i, frame in enumerate(frames)
-    ]
     buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows([_COLUMNS, *rows])
+    told = (row._replace(timestamp_s=repr(row.timestamp_s)) for row in rows)
+    csv.writer(buffer, lineterminator="\n").writerows([FrameRow._fields, *told])
     with atomic_path(path) as temporary:
         temporary.write_text(buffer.getvalue(), encoding="utf-8")
+
+
+def read_frame_table(folder: RunFolder, count: int) -> list[FrameRow]:
+    """Reads `frames.csv`; none where it is lost, or does not fit so many poses."""
+    try:
+        rows = [
+            FrameRow(int(row["frame"]), row["name"], float(row["timestamp_s"]), row["skipped"])
+            for row in csv.DictReader(io.StringIO(read_text(folder.frames)))
+        ]
+    except (JaxmapError, ValueError, KeyError, TypeError, csv.Error):
+        return []
+    return rows if sum(not row.skipped for row in rows) == count else []
 
 
 def read_run_frames(folder: RunFolder, site_origin: Float64[np.ndarray, "3"]) -> RunFrames:
@@ -72,12 +96,9 @@ def read_run_frames(folder: RunFolder, site_origin: Float64[np.ndarray, "3"]) ->
     track, notes = read_poses(folder.poses), []
     count = len(track.T)
     index, names = np.arange(count), ()
-    try:
-        rows = [row for row in csv.DictReader(io.StringIO(read_text(folder.frames))) if not row["skipped"]]
-        if len(rows) != count:
-            raise ValueError
-        index, names = np.array([int(row["frame"]) for row in rows]), tuple(row["name"] for row in rows)
-    except (JaxmapError, ValueError, KeyError, TypeError, csv.Error):
+    if fused := [row for row in read_frame_table(folder, count) if not row.skipped]:
+        index, names = np.array([row.frame for row in fused]), tuple(row.name for row in fused)
+    else:
         notes.append(f"no {folder.frames.name} that fits the poses: frames have no names, and count as they were fused")
     T, camera, size_px, max_range_m = track.T.copy(), None, (0, 0), 10.0
     T[:, :3, 3] -= site_origin

@@ -11,6 +11,8 @@ import numpy as np
 
 from jaxmap.errors import FrameError
 from jaxmap.export.voxels import occupied_voxels
+from jaxmap.labels import IGNORE
+from jaxmap.mapping.observations import open_observations
 from jaxmap.mapping.sequence import FusedFrame
 from jaxmap.report.first_seen import first_seen
 from jaxmap.report.pictures import colourise_disparity, overlay_labels
@@ -43,12 +45,13 @@ def view_run(run: Path, save: Path | None) -> list[str]:
     folder = RunFolder(run)
     contents = read_run(run)
     frames = read_run_frames(folder, contents.attributes.site_origin)
-    with recording(contents.name, contents.classes, save) as log:
+    with recording(contents.name, contents.classes, frames.T_world_camera, save) as log:
         log.path(frames.T_world_camera[:, :3, 3])
         for frame, T, timestamp_s in zip(frames.index, frames.T_world_camera, frames.timestamps_s, strict=True):
             log.at(int(frame), float(timestamp_s))
             log.pose(T)
-        notes = [*_log_pictures(log, contents, frames), *_log_voxels(log, contents, frames)]
+        pictures = [*_log_pictures(log, contents, frames), *_log_observed(log, folder, contents, frames)]
+        notes = [*pictures, *_log_voxels(log, contents, frames)]
         for note in notes:
             log.note(note)
     return notes
@@ -75,6 +78,34 @@ def _log_pictures(log: Recording, contents: RunContents, frames: RunFrames) -> I
     kinds = ", ".join(kind for kind in PICTURES if any(kind in pictures for pictures in contents.pictures.values()))
     yield f"{len(frames.index)} poses; pictures ({kinds or 'none'}) of {shown} key frames"
     yield from frames.notes
+
+
+def _log_observed(log: Recording, folder: RunFolder, contents: RunContents, frames: RunFrames) -> Iterator[str]:
+    """Logs disparity and likeliest classes of the other frames, where the run has kept them, and tells of how many."""
+    if not folder.observations.exists():
+        return
+    observations, shown = open_observations(folder.observations), 0
+    place = {ref.name: index for index, ref in enumerate(observations.frames)}
+    own = np.full(256, IGNORE, np.uint8)
+    for index, name in enumerate(observations.attributes.classes):
+        if name in contents.classes:
+            own[index] = contents.classes.index(name)
+    for index, name, timestamp_s in zip(frames.index, frames.names, frames.timestamps_s, strict=False):
+        if f"{index:06d}" in contents.pictures or name not in place:
+            continue
+        try:
+            seen = observations.observation(place[name])
+        except FrameError as error:
+            yield f"a frame is left out: {error}"
+            continue
+        log.at(int(index), float(timestamp_s))
+        log.no_left()
+        log.picture("disparity", colourise_disparity(seen.disparity_px))
+        if seen.kept is not None and contents.classes:
+            labels = own[seen.kept if seen.kept.ndim == 2 else seen.kept.argmax(axis=-1)]
+            log.picture("labels", overlay_labels(np.zeros(labels.shape, np.uint8), labels, contents.classes, 1.0))
+        shown += 1
+    yield f"disparity and likeliest classes of {shown} other frames, as they were perceived"
 
 
 def _row_of(name: str, contents: RunContents, frames: RunFrames) -> int | None:
@@ -126,7 +157,7 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
     """
     camera, T_world_camera = plan.front_end.camera, plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified
     classes, last, shown_s = plan.labeller.classes, len(plan.sequence.frames) - 1, -np.inf
-    with recording(plan.sequence.name, classes, save) as log:
+    with recording(plan.sequence.name, classes, T_world_camera, save) as log:
 
         def show(fused: FusedFrame, voxel_map: VoxelMap) -> None:
             nonlocal shown_s
@@ -138,7 +169,7 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
                 # Observations have that of key frames alone.
                 if left.size:
                     log.left(left, pinhole(camera), camera.width_px)
-                log.picture("disparity", colourise_disparity(prepared.rectified.disparity_px))
+                log.picture("disparity", colourise_disparity(plan.front_end.disparity_of(prepared.rectified)))
                 if classes and prepared.index in plan.key_frames:
                     number = int(voxel_map.frames_fused) - 1
                     labels = plan.mapper.label_image(prepared.frame, plan.params, plan.key, number)

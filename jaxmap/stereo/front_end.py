@@ -14,6 +14,7 @@ from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.align import alignment_homography, estimate_alignment, match_features
 from jaxmap.stereo.blank import blank_reason
+from jaxmap.stereo.jax_matcher import JaxMatcher, make_matcher
 from jaxmap.stereo.match import Matcher, StereoOptions, as_grey
 from jaxmap.stereo.near import NearGuard
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
@@ -25,24 +26,27 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    The images are empty where observations, which hold none, are read again. `too_near` is the share of pixels that
-    were left out because they are nearer than the searched disparities reach, and `nearest_px` the disparity of the
-    nearest of them.
+    The images are empty where observations, which hold none, are read again; the disparity is None where the compiled
+    step finds it. `blind` are pixels that have none, whatever the images show: the raw image does not reach there, or
+    something is too near. `too_near` is the share of pixels that were left out because they are nearer than the
+    searched disparities reach, and `nearest_px` the disparity of the nearest of them.
     """
 
     left: np.ndarray
     right: np.ndarray
-    disparity_px: np.ndarray
+    disparity_px: np.ndarray | None
     rectify_s: float
     match_s: float
     too_near: float = 0.0
     nearest_px: float = 0.0
+    blind: np.ndarray | None = None
 
 
 class StereoFrontEnd:
     """Rectification, where the images are raw, and matching; may be called from several threads.
 
     Attributes:
+        matcher: gives disparities to whatever asks for them on the host: OpenCV's, or that of the step, compiled apart.
         camera: the rectified camera.
         rectified_here: whether the images are raw, and rectified by it.
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
@@ -76,7 +80,7 @@ class StereoFrontEnd:
             self._right_homography = alignment_homography(camera, alignment_rad)
         self.rectified_here = self.rectifier is not None
         self.camera: StereoCamera = camera
-        self.matcher = Matcher(options, camera.width_px)
+        self.matcher: Matcher | JaxMatcher = make_matcher(options, camera.width_px)
         self.near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> RectifiedFrame:
@@ -89,6 +93,17 @@ class StereoFrontEnd:
         Raises:
             FrameError: the sizes disagree with each other or with the calibration, or an image shows nothing.
         """
+        ready, stages_s = self.ready(left, right), {}
+        with timed_stage("match", stages_s):
+            matched = self.matched(ready)
+        return matched._replace(match_s=ready.match_s + stages_s["match"])
+
+    def ready(self, left: np.ndarray, right: np.ndarray) -> RectifiedFrame:
+        """Rectifies one pair for a step that matches it: as when it is called, but for the disparity.
+
+        Raises:
+            FrameError: the sizes disagree with each other or with the calibration, or an image shows nothing.
+        """
         stages_s: dict[str, float] = {}
         self._check_sizes(left, right)
         with timed_stage("rectify", stages_s):
@@ -96,18 +111,27 @@ class StereoFrontEnd:
                 if (reason := blank_reason(image)) is not None:
                     raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
             left, right = self.rectify(left, right)
+        blind = None if self.rectifier is None else ~self.rectifier.seen
         with timed_stage("match", stages_s):
-            both_grey = as_grey(left), as_grey(right)
-            disparity_px = self.matcher(*both_grey)
-            if self.rectifier is not None:
-                disparity_px[~self.rectifier.seen] = np.nan
-            near = None if self.near_guard is None else self.near_guard(*both_grey)
-            if near is not None:
-                disparity_px[near.pixels] = np.nan
+            near = None if self.near_guard is None else self.near_guard(as_grey(left), as_grey(right))
         times_s = stages_s["rectify"], stages_s["match"]
         if near is None:
-            return RectifiedFrame(left, right, disparity_px, *times_s)
-        return RectifiedFrame(left, right, disparity_px, *times_s, float(near.pixels.mean()), near.disparity_px)
+            return RectifiedFrame(left, right, None, *times_s, blind=blind)
+        blind = near.pixels if blind is None else blind | near.pixels
+        return RectifiedFrame(left, right, None, *times_s, float(near.pixels.mean()), near.disparity_px, blind)
+
+    def matched(self, frame: RectifiedFrame) -> RectifiedFrame:
+        """The frame with its disparity."""
+        return frame._replace(disparity_px=self.disparity_of(frame))
+
+    def disparity_of(self, frame: RectifiedFrame) -> np.ndarray:
+        """The disparity of a rectified pair, float32 (H, W): its own, or matched now where the step finds it."""
+        if frame.disparity_px is not None:
+            return frame.disparity_px
+        disparity_px = self.matcher(frame.left, frame.right)
+        if frame.blind is not None:
+            disparity_px[frame.blind] = np.nan
+        return disparity_px
 
     def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rectified pair; the images as they are where nothing is to be done.
@@ -140,7 +164,7 @@ class StereoFrontEnd:
             JaxmapError: the pair matches far better the other way round.
         """
         if self._looks_swapped(frame):
-            valid = np.isfinite(frame.disparity_px).mean()
+            valid = np.isfinite(self.disparity_of(frame)).mean()
             raise JaxmapError(
                 f"left and right look swapped: {valid:.0%} of the disparities are valid, far more the other way round",
                 where=where,
@@ -149,7 +173,12 @@ class StereoFrontEnd:
 
     def _looks_swapped(self, frame: RectifiedFrame) -> bool:
         """Whether the pair matches far better the other way round, unless its features say that it does not."""
-        if not self.matcher.looks_swapped(frame.left, frame.right, frame.disparity_px):
+        # The shares of valid pixels that tell are OpenCV's.
+        by_opencv = self.matcher
+        if not isinstance(by_opencv, Matcher):
+            by_opencv, frame = Matcher(by_opencv.options, self.camera.width_px), frame._replace(disparity_px=None)
+        disparity_px = by_opencv(frame.left, frame.right) if frame.disparity_px is None else frame.disparity_px
+        if not by_opencv.looks_swapped(frame.left, frame.right, disparity_px):
             return False
         # What is nearer than the matcher sees has few true matches either way.
         found = estimate_alignment(self.camera, match_features(frame.left, frame.right))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -14,6 +15,8 @@ from jaxmap.host.settings import NotNegative, count, options
 _SUBPIXELS = 16
 _MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
 """OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
+_OF_OPENCV = ("mode", "p1", "p2", "pad_left")
+_OF_STEP = ("cost", "paths", "step_penalty", "jump_penalty", "soft", "temperature")
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
 """Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
@@ -31,6 +34,21 @@ class StereoOptions:
     align: bool = False
     """Estimate a rotation of the right camera under which the rows of both images agree, from matches in some frames,
     and rectify all frames with it: for a calibration that is slightly off (`jaxmap check` says so)."""
+    matcher: Literal["opencv", "sgm", "mccnn"] = "opencv"
+    """OpenCV's on the host, or semi-global matching inside the compiled step, by hand-made costs or a network's."""
+    cost: Literal["census", "bt"] = "census"
+    """matcher sgm: compares the order of grey levels around two pixels, or grey levels (Birchfield-Tomasi)."""
+    paths: Literal[4, 8] = 8
+    """matchers sgm, mccnn: directions along which costs are aggregated."""
+    step_penalty: Annotated[float, Interval(ge=0, le=1)] | None = None
+    """matchers sgm, mccnn: cost of a disparity step of one, where the worst match costs 1; by default, what suits the
+    cost."""
+    jump_penalty: Annotated[float, Interval(ge=0, le=2)] | None = None
+    """matchers sgm, mccnn: cost of a greater step."""
+    soft: bool = False
+    """matchers sgm, mccnn: soft minima, slower, through which gradients reach images and penalties."""
+    temperature: Annotated[float, Interval(ge=1e-4, le=10)] = 0.05
+    """How soft, in units of the cost."""
     mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
     min_disparity_px: Annotated[int, count(1024, least=-1024)] = 0
@@ -82,6 +100,18 @@ class StereoOptions:
         p1, p2 = self.penalties()
         if not p1 < p2:
             raise _bad(f"p1 is {p1} and p2 is {p2}", "take 0 < p1 < p2")
+        self._refuse_what_means_nothing()
+
+    def _refuse_what_means_nothing(self) -> None:
+        """Refuses options that differ from their defaults and belong to another matcher."""
+        others = _OF_OPENCV if self.matcher != "opencv" else _OF_STEP
+        others = (*others, "cost") if self.matcher == "mccnn" else others
+        for one in fields(self):
+            if one.name in others and getattr(self, one.name) != one.default:
+                raise _bad(
+                    f"{one.name} is {getattr(self, one.name)}, which means nothing to the matcher {self.matcher}",
+                    f"leave it at {one.default}, or choose another --stereo.matcher",
+                )
 
     def penalties(self) -> tuple[int, int]:
         """The penalties p1 and p2 of disparity steps."""

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxmap.stereo.align import shrunk_grey
+from jaxmap.stereo.jax_matcher import JaxMatcher
 from jaxmap.stereo.match import Matcher, StereoOptions
 
 WIDTH_PX = 256
@@ -39,7 +40,7 @@ class NearGuard:
         width_px: of the full images.
     """
 
-    def __init__(self, matcher: Matcher, width_px: int) -> None:
+    def __init__(self, matcher: Matcher | JaxMatcher, width_px: int) -> None:
         self._shrink = max(2, round(width_px / WIDTH_PX))
         self._limit_px = matcher.options.min_disparity_px + matcher.num_disparities
         width_px //= self._shrink

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import cv2
+import jaxlie
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxmap.errors import JaxmapError
-from jaxmap.types import MOST_CAMERA_PX, StereoCamera, make_stereo_camera
+from jaxmap.matching.rectify import RawCamera, RawPair
+from jaxmap.types import MOST_CAMERA_PX, DistortionModel, StereoCamera, make_stereo_camera, to_device
 
-DistortionModel = Literal["opencv", "equidistant"]
+_COEFFICIENTS = 14
+"""Of a lens, as the compiled step takes them."""
 
 
 @dataclass(frozen=True)
@@ -194,3 +197,20 @@ def rectify_labels(labels: np.ndarray, maps: tuple[np.ndarray, np.ndarray], outs
     u_px = maps[0][..., 0] + np.float32(1 / 32) * (maps[1] & 31)
     v_px = maps[0][..., 1] + np.float32(1 / 32) * (maps[1] >> 5)
     return cv2.remap(labels, u_px, v_px, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)
+
+
+def make_raw_pair(rig: StereoRig, R_aligned: np.ndarray | None = None) -> RawPair:
+    """The numbers of a calibration on the device; `R_aligned` (3, 3) as `make_rectifier` takes it."""
+
+    def camera(K: np.ndarray, distortion: np.ndarray) -> RawCamera:
+        numbers = {"fx_px": K[0, 0], "fy_px": K[1, 1], "cx_px": K[0, 2], "cy_px": K[1, 2]}
+        count = 4 if rig.model == "equidistant" else _COEFFICIENTS
+        lens = np.pad(distortion, (0, count - distortion.size))
+        leaves = {name: to_device(value, np.float32) for name, value in numbers.items()}
+        return RawCamera(**leaves, distortion=to_device(lens, np.float32), model=rig.model)
+
+    turn = jaxlie.SO3.from_matrix(to_device(np.eye(3) if R_aligned is None else R_aligned, np.float32))
+    R_right_left = jaxlie.SO3.from_matrix(to_device(rig.R_right_left, np.float32))
+    moved = jaxlie.SE3.from_rotation_and_translation(R_right_left, to_device(rig.t_right_left_m, np.float32))
+    left, right = camera(rig.K_left, rig.distortion_left), camera(rig.K_right, rig.distortion_right)
+    return RawPair(left, right, moved, turn)

@@ -108,7 +108,7 @@ def build_cache(
     kept, of_frames = [], []
     for number, frame in enumerate(frames):
         seen = observe(frame, params, jax.random.fold_in(key, number))
-        kept.append(_thinned(jax.tree.map(np.asarray, seen), frame.disparity_px.shape, block_px))
+        kept.append(_thinned(jax.tree.map(np.asarray, seen), frame.matched_px.shape, block_px))
         of_frames.append(seen["of_frame"])
         if recipe.rule.carve:
             _count_freed(freed, np.asarray(seen["free"]), np.asarray(seen["start"]), recipe.grid.shape, kept[-1].voxel)
@@ -138,7 +138,7 @@ def _observer(recipe: CacheRecipe) -> Any:
         cloud = project(
             params.camera,
             pose,
-            frame.disparity_px,
+            frame.matched_px,
             recipe.depth_range_m,
             fusion.disparity_sigma_px,
             labeller.ground,

@@ -11,7 +11,6 @@ same to the bit.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from observed_scenes import FARTHEST_M, VOXEL_M, write_traverse
 
 from jaxmap.datasets.poses import write_tum
 from jaxmap.host.cache import keep_compiled_programs
@@ -27,9 +27,6 @@ from jaxmap.mapping.store import load_map
 from jaxmap.runs.config import config_of_observations
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.fusing import map_observations
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
-from observed_scenes import FARTHEST_M, VOXEL_M, write_traverse
 
 
 @contextmanager

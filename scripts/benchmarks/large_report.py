@@ -20,6 +20,7 @@ from jaxmap.host.memory import peak_resident_mib
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.store import open_map
+from jaxmap.mapping.tile_arrays import TileValues
 from jaxmap.mapping.tiles import TILE, TileStore, whole_tiles
 from jaxmap.report.run_page import write_report
 from jaxmap.runs.exports import write_exports
@@ -72,7 +73,7 @@ def write_map(run: Path, path: np.ndarray) -> None:
         for k in range(layers // TILE[2]):
             part = values[..., k * TILE[2] : (k + 1) * TILE[2]]
             if part.any():
-                store.write((int(i), int(j), k), np.ascontiguousarray(part))
+                store.write((int(i), int(j), k), TileValues(part))
     attributes = MapAttributes(crs="EPSG:32631", site_origin=SITE, progress={"complete": True})
     store.commit(len(path), attributes)
     store.close()

@@ -39,7 +39,7 @@ from jaxmap.host.memory import peak_resident_mib, restart_with_lasting_memory
 from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import compile_step, make_mapper
-from jaxmap.mapping.tiles import MovingBlock, TileStore, block_shape, whole_tiles
+from jaxmap.mapping.tiles import MovingBlock, TileStore, block_shape, channels_of, whole_tiles
 from jaxmap.runs.config import check_config
 from jaxmap.runs.mapping_plan import DEFAULT_VOXEL_M, Plan, plan_run
 from jaxmap.types import Frame, to_device
@@ -136,7 +136,7 @@ def map_traverse(given: argparse.Namespace, plan: Plan, frames: list[Frame], pos
     grid = whole_tiles(grid_around_views(camera, poses, reach_m, tuple(given.voxel_size_m), (2.5, 1.5)))
     classes = plan.labeller.classes
     window = window_shape(grid, camera, reach_m, poses)
-    shape = block_shape(grid, window, 1 + len(classes), given.memory_gib * 2**30)
+    shape = block_shape(grid, window, channels_of(len(classes), surface=plan.rule.surface), given.memory_gib * 2**30)
     assert shape is not None, "--memory-gib holds no block"
     mapper = make_mapper(camera, grid, plan.labeller, plan.rule, plan.depth_range_m, T_world_camera=poses)
     boxes = view_boxes(grid, camera, poses, reach_m)
@@ -144,7 +144,7 @@ def map_traverse(given: argparse.Namespace, plan: Plan, frames: list[Frame], pos
         f"{len(poses)} frames; grid {grid.shape}, window {window}, block {shape}, device {jax.devices()[0].device_kind}"
     )
     with tempfile.TemporaryDirectory(dir=given.folder) as name:
-        block = MovingBlock(TileStore(Path(name, "map.zarr"), grid, classes), shape)
+        block = MovingBlock(TileStore(Path(name, "map.zarr"), grid, classes, surface=plan.rule.surface), shape)
         voxel_map, saved_s = block.begin(0), 0.0
         watch = Watch(max(len(poses) // ROWS, 1), given.every_m, Path(name))
         for index, pose in enumerate(poses):
@@ -175,7 +175,7 @@ def map_with_octomap(given: argparse.Namespace, plan: Plan, frames: list[Frame],
     (near_m, far_m), camera = plan.depth_range_m, plan.front_end.camera
     clouds = []
     for frame in frames:
-        points, valid = (np.asarray(value) for value in disparity_to_points(camera, frame.disparity_px))
+        points, valid = (np.asarray(value) for value in disparity_to_points(camera, frame.matched_px))
         depth_m = points[..., 2]
         clouds.append(points[valid & (depth_m >= near_m) & (depth_m <= far_m)].astype(np.float64))
     tree, before_mib, started_s = octomap.OcTree(min(given.voxel_size_m)), resident_mib(), time.perf_counter()

@@ -67,7 +67,7 @@ def changed(config: MapConfig, sections: dict[str, dict[str, object]]) -> MapCon
 
 def filtered(prepared: PreparedFrame, change: Callable[[np.ndarray], np.ndarray]) -> PreparedFrame:
     """A frame with another disparity."""
-    disparity_px = change(np.array(prepared.frame.disparity_px))
+    disparity_px = change(np.array(prepared.frame.matched_px))
     return replace(prepared, frame=replace(prepared.frame, disparity_px=disparity_px))
 
 

@@ -130,9 +130,9 @@ def compare(plan: Plan, count: int) -> Comparison:
     for frame in frames_of(plan, count):
         # Without the disparities that are not mapped: ours would also see through what lies before farther points, but
         # OctoMap has a greatest range, no depth.
-        points, valid = disparity_to_points(camera, frame.disparity_px)
+        points, valid = disparity_to_points(camera, frame.matched_px)
         kept = valid & (points[..., 2] >= plan.depth_range_m[0]) & (points[..., 2] <= plan.depth_range_m[1])
-        near = replace(frame, disparity_px=jnp.where(kept, frame.disparity_px, jnp.nan))
+        near = replace(frame, disparity_px=jnp.where(kept, frame.matched_px, jnp.nan))
         cloud = np.asarray(transform_points(frame.T_world_camera, points), np.float64)[np.asarray(kept)]
         origin = np.asarray(frame.T_world_camera.translation(), np.float64)
         voxel_map, _ = mapper.step(voxel_map, near, params, key)
@@ -206,7 +206,7 @@ def frame_cause(
     column, row = np.rint(u_px), np.rint(v_px)
     in_view = in_front & (column >= 0) & (column < camera.width_px) & (row >= 0) & (row < camera.height_px)
     pixel = (np.where(in_view, row, 0).astype(int), np.where(in_view, column, 0).astype(int))
-    points, valid = (np.asarray(values) for values in disparity_to_points(camera, frame.disparity_px))
+    points, valid = (np.asarray(values) for values in disparity_to_points(camera, frame.matched_px))
     measured_m, known = points[..., 2][pixel], valid[pixel]
     half_width_px = 0.5 * float(np.mean(size_m)) * float(camera.fx_px) / np.maximum(depth_m, 1e-3)
     half_diagonal_m, gap_m = 0.5 * float(np.linalg.norm(size_m)), measured_m - depth_m

@@ -8,11 +8,12 @@ are free in truth, in view, at least 3 m apart, and between which true rock bars
 are such pairs. Prints, for each way to see rocks, how many paths were found and how many of them collide: come closer
 to a true rock of more than 0.3 m than the rover's radius; and their length over that of the same planner where it
 knows true heights and all rocks of more than 0.3 m. Rows plane, network and relief plan by what labels say alone;
-hazards by heights alone; ours by both.
+hazards by heights alone; ours by both. The scores of a world are kept in its folder, as planning.json.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,12 +29,12 @@ from jaxmap.datasets.rasters import read_heights, read_window
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.surface import Surface
 from jaxmap.geometry.grid import exact_corner
-from jaxmap.mapping.store import MapAttributes
-from jaxmap.planning.ground import Ground, read_ground
+from jaxmap.mapping.store import MapAttributes, in_memory
+from jaxmap.planning.ground import Ground
 from jaxmap.planning.options import RoverOptions
 from jaxmap.runs.config import MapConfig
 from jaxmap.runs.mapping_plan import Plan
-from jaxmap.runs.planning import Costs, costs_of, plan_path
+from jaxmap.runs.planning import ROCK, Costs, costs_of, plan_path, read_site
 from jaxmap.types import GridSpec
 
 LEAST_ROCK_M, LEAST_APART_M, IN_VIEW, ROCK_LABEL = 0.3, 3.0, 0.2, 2
@@ -61,7 +62,8 @@ def worlds(folder: Path | None, seeds: list[int], known: list[Path]) -> Iterator
     for seed in seeds:
         assert folder is not None, "--seeds needs --worlds"
         world = folder / f"{seed}"
-        jaxmap("simulate", "--out", world, "--seed", seed, *RENDERING)
+        if not (world / "planning.json").exists():
+            jaxmap("simulate", "--out", world, "--seed", seed, *RENDERING)
         yield world
 
 
@@ -102,7 +104,8 @@ def sample(values: np.ndarray, T_crs_pixel: np.ndarray, x: np.ndarray, y: np.nda
 
 def draw_pairs(truth: Costs, seen: np.ndarray, near_rock: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
     """Pairs of cells, as places (2, 2) of the map's world."""
-    rng, cells = np.random.default_rng(seed), np.argwhere(truth.terrain.drivable & ~near_rock & seen)
+    free = truth.terrain.drivable & (truth.costs.rock <= ROCK)
+    rng, cells = np.random.default_rng(seed), np.argwhere(free & ~near_rock & seen)
     connected, _ = components(truth.terrain.drivable)
     barred, others = [], []
     for _ in range(4000):
@@ -125,16 +128,16 @@ def ways(frames: Frames, rover: RoverOptions, world: Traverse) -> tuple[dict[str
         plan = frames.plan(config)
         voxel_map = fuse(plan, frames.prepared)
         attributes = MapAttributes(plan.sequence.crs, plan.sequence.site_origin)
-        rock = plan.rule.target(voxel_map.classes)
-        ground = read_ground(voxel_map, plan.params.fusion, plan.rule, rock)
+        reader = in_memory(voxel_map, attributes)
+        site, ground = read_site(reader, plan.params.fusion, plan.rule, reader.whole)
         if not seen_by:
-            seen_by["truth"] = costs_of(voxel_map, attributes, truth.ground, rover, "rock")
+            seen_by["truth"] = costs_of(replace(site, rock="rock"), truth.ground, rover)
         if name == "ours":
             blind = ground._replace(rock_probability=np.zeros_like(ground.rock_probability))
-            seen_by["hazards"] = costs_of(voxel_map, attributes, blind, rover, rock)
+            seen_by["hazards"] = costs_of(site, blind, rover)
         else:
             ground = ground._replace(surface=ground.surface._replace(known=np.zeros_like(ground.seen)))
-        seen_by[name] = costs_of(voxel_map, attributes, ground, rover, rock)
+        seen_by[name] = costs_of(site, ground, rover)
     cell_m = seen_by["truth"].terrain.cell_m
     far_m = np.full(truth.large_rock.shape, np.inf)
     if truth.large_rock.any():
@@ -145,53 +148,66 @@ def ways(frames: Frames, rover: RoverOptions, world: Traverse) -> tuple[dict[str
     return {**seen_by, "truth": replace(seen_by["truth"], terrain=free)}, far_m
 
 
-class Tally:
-    """What came of one way to see the ground, over all worlds."""
+class Tally(NamedTuple):
+    """Paths asked for, those not found, those that collide, and how much longer each is than with the truth."""
 
-    def __init__(self) -> None:
-        self.asked = self.refused = self.collided = 0
-        self.longer: list[float] = []
+    asked: int = 0
+    refused: int = 0
+    collided: int = 0
+    longer: tuple[float, ...] = ()
 
-    def add(self, costs: Costs, ends: np.ndarray, far_m: np.ndarray, radius_m: float, truth_m: float) -> None:
-        """Plans one path and scores it."""
-        self.asked += 1
-        try:
-            plan = plan_path(costs, *(ends + costs.attributes.site_origin[:2]))
-        except JaxmapError:
-            self.refused += 1
-            return
-        i, j = costs.terrain.cell_of(plan.places_m).T
-        # Within half a column of the radius is rounding.
-        self.collided += bool((far_m[i, j] < radius_m - costs.terrain.cell_m.max() / 2).any())
-        self.longer.append(plan.metrics["length_m"] / truth_m - 1)
+    def __add__(self, other: Any) -> Tally:
+        return Tally(*(mine + its for mine, its in zip(self, other, strict=True)))
+
+
+def scored(costs: Costs, ends: np.ndarray, far_m: np.ndarray, radius_m: float, truth_m: float) -> Tally:
+    """Plans one path and scores it."""
+    try:
+        plan = plan_path(costs, *(ends + costs.site.attributes.site_origin[:2]))
+    except JaxmapError:
+        return Tally(asked=1, refused=1)
+    i, j = costs.terrain.cell_of(plan.places_m).T
+    # Within half a column of the radius is rounding.
+    collided = (far_m[i, j] < radius_m - costs.terrain.cell_m.max() / 2).any()
+    return Tally(1, 0, int(collided), (plan.metrics["length_m"] / truth_m - 1,))
+
+
+def tallies_of(folder: Path, pairs: int, seed: int, rover: RoverOptions) -> dict[str, Tally]:
+    """The tallies of a world."""
+    world = Traverse(folder)
+    seen_by, far_m = ways(Frames(world.sequence), rover, world)
+    in_view = np.asarray(seen_by["ours"].costs.unknown) <= IN_VIEW
+    tallies = dict.fromkeys(seen_by, Tally())
+    for ends in draw_pairs(seen_by["truth"], in_view, far_m < rover.radius_m + rover.margin_m, pairs, seed):
+        site = seen_by["truth"].site.attributes.site_origin[:2]
+        truth_m = plan_path(seen_by["truth"], *(ends + site)).metrics["length_m"]
+        for name, costs in seen_by.items():
+            tallies[name] += scored(costs, ends, far_m, rover.radius_m, truth_m)
+    return tallies
 
 
 def main() -> None:
-    """Prints the table."""
+    """Prints a line for each world, and the table."""
     parser = command_line(__doc__)
     parser.add_argument("--worlds", type=Path, help="folder of rendered worlds")
     parser.add_argument("--seeds", type=int, nargs="*", default=[])
     parser.add_argument("--known", type=Path, nargs="*", default=[])
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--json", type=Path)
-    given, rover = parse(parser), RoverOptions()
-    tallies: dict[str, Tally] = {}
+    given, sums = parse(parser), dict[str, Tally]()
     for number, folder in enumerate(worlds(given.worlds, given.seeds, given.known)):
-        world = Traverse(folder)
-        seen_by, far_m = ways(Frames(world.sequence), rover, world)
-        in_view = np.asarray(seen_by["ours"].costs.unknown) <= IN_VIEW
-        pairs = draw_pairs(seen_by["truth"], in_view, far_m < rover.radius_m + rover.margin_m, given.pairs, number)
-        for ends in pairs:
-            site = seen_by["truth"].attributes.site_origin[:2]
-            truth_m = plan_path(seen_by["truth"], *(ends + site)).metrics["length_m"]
-            for name, costs in seen_by.items():
-                tallies.setdefault(name, Tally()).add(costs, ends, far_m, rover.radius_m, truth_m)
-        print(f"{folder.name}: {len(pairs)} pairs", flush=True)
+        done = folder / "planning.json"
+        if not done.exists():
+            done.write_text(json.dumps(tallies_of(folder, given.pairs, number, RoverOptions())))
+        tallies = {name: Tally(*tally[:3], tuple(tally[3])) for name, tally in json.loads(done.read_text()).items()}
+        sums = {name: sums.get(name, Tally()) + tally for name, tally in tallies.items()}
+        told = ", ".join(f"{name} {tally.refused}/{tally.collided}" for name, tally in tallies.items())
+        print(f"{folder.name}: {tallies['truth'].asked} pairs; without a path/colliding: {told}", flush=True)
     table = Table(
         {"seen by": "<10", "pairs": "7d", "no path": "9d", "collide": "9d", "mean longer": "13.1%", "worst": "9.1%"}
     )
-    for name, tally in tallies.items():
-        longer = tally.longer or [float("nan")]
+    for name, tally in sums.items():
+        longer = tally.longer or (float("nan"),)
         table.row(name, tally.asked, tally.refused, tally.collided, float(np.mean(longer)), max(longer))
     table.write(given.json)
 

@@ -64,7 +64,7 @@ def rover_pair(table: Table, model: Path | None) -> None:
         labels = np.asarray(plan.mapper.label_image(frame, plan.params, plan.key, 0))
         shape, known = labels.shape, labels < len(plan.labeller.classes)
         bf_px_m = float(plan.params.camera.baseline_m * plan.params.camera.fx_px)
-        ground = known & (np.asarray(frame.disparity_px) > bf_px_m / GROUND_RANGE_M) & ~area(shape, *ROVER)
+        ground = known & (np.asarray(frame.matched_px) > bf_px_m / GROUND_RANGE_M) & ~area(shape, *ROVER)
         ground &= ~cv2.dilate(area(shape, *BOULDERS.values()).astype(np.uint8), np.ones((RIM_PX, RIM_PX))).astype(bool)
         ground[:HORIZON_PX] = False
         inside = [area(shape, outline) & known for outline in BOULDERS.values()]

@@ -122,7 +122,8 @@ def test_through_any_window_the_kernel_adds_the_same_bits(pose, rng, soft):
     tile = make_voxel_map(part, CLASSES, surface=True)
     tiled, _ = by_kernel(tile, sighting, part, params, MEAN, DEPTHS_M)
     np.testing.assert_array_equal(tiled.log_odds, whole.log_odds[(slice(None), *box)])
-    np.testing.assert_array_equal(tiled.surface, windowed.surface[(slice(None), *box[:2])])
+    layers = tiled.surface.shape[3]
+    np.testing.assert_array_equal(tiled.surface, windowed.surface[(slice(None), *box[:2], slice(layers))])
     outside = np.array(windowed.log_odds)
     outside[(slice(None), *box)] = 0
     assert not outside.any()

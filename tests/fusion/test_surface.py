@@ -12,14 +12,21 @@ import reference_hazards
 
 from jaxmap.errors import JaxmapError
 from jaxmap.fusion.params import make_fusion_params
-from jaxmap.fusion.surface import add_heights, combine, gather_heights, read_surface
+from jaxmap.fusion.surface import add_heights, combine, gather_heights, over_layers, read_surface
 from jaxmap.mapping.store import MapAttributes, load_map, save_map
 from jaxmap.types import VoxelMap, make_grid, make_voxel_map
 
 pytestmark = pytest.mark.slow
 LOWER, CELL_M, SHAPE = np.array([0.0, 0.0, -1.0]), np.array([0.1, 0.1, 0.2]), (12, 9, 10)
 GRID = make_grid(LOWER.tolist(), (LOWER + CELL_M * SHAPE).tolist(), CELL_M.tolist())
-gather = jax.jit(gather_heights)
+
+
+within = jax.jit(gather_heights)
+
+
+def gather(grid, points, sigma_m, keep):
+    """Heights of a whole grid."""
+    return within(grid, grid, points, sigma_m, keep)
 
 
 def drawn(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -34,7 +41,10 @@ def close(one, other) -> None:
 
 def test_statistics_equal_the_twin():
     points, sigma_m, keep = drawn(0)
-    close(gather(GRID, points, sigma_m, keep), reference_hazards.heights(points, sigma_m, keep, LOWER, CELL_M, SHAPE))
+    close(
+        over_layers(gather(GRID, points, sigma_m, keep)),
+        reference_hazards.heights(points, sigma_m, keep, LOWER, CELL_M, SHAPE),
+    )
 
 
 def test_statistics_of_parts_are_those_of_all_in_any_order():
@@ -45,7 +55,8 @@ def test_statistics_of_parts_are_those_of_all_in_any_order():
     close(combine(combine(parts[0], parts[1]), parts[2]), whole)
     close(combine(parts[2], combine(parts[1], parts[0])), whole)
     np.testing.assert_array_equal(combine(whole, jnp.zeros_like(whole)), whole)
-    np.testing.assert_array_equal(combine(jnp.zeros_like(whole), whole)[:2], whole[:2])
+    np.testing.assert_array_equal(combine(jnp.zeros_like(whole), whole), whole)
+    np.testing.assert_array_equal(combine(np.asarray(parts[0]), np.asarray(parts[1])), combine(parts[0], parts[1]))
 
 
 def test_points_that_are_no_points_leave_nothing():
@@ -60,14 +71,22 @@ def test_points_that_are_no_points_leave_nothing():
     close(more, gather(GRID, points, sigma_m, keep))
 
 
-def test_a_window_holds_what_the_whole_grid_does():
-    points, sigma_m, keep = drawn(3)
-    inside = keep & (points[:, 0] > 0.3) & (points[:, 0] < 0.8) & (points[:, 1] > 0.2) & (points[:, 1] < 0.7)
-    window = replace(GRID, first=GRID.first + jnp.array([3, 2, 0]), shape=(5, 5, 10))
-    so_far = gather(GRID, *drawn(4))
-    before = replace(make_voxel_map(GRID, ()), surface=so_far)
-    after = add_heights(before, gather(window, points, sigma_m, inside), window)
-    close(after, combine(so_far, gather(GRID, points, sigma_m, inside)))
+@pytest.mark.parametrize("height", [10, 40, 64])
+@pytest.mark.parametrize("first", [0, 5, 15])
+def test_a_window_holds_what_the_whole_grid_does(height, first):
+    tall = replace(GRID, first=jnp.array([0, 0, first - 16]), shape=(*SHAPE[:2], height))
+    rng = np.random.default_rng(3)
+    lattice = rng.uniform(0, 1, (3000, 3)) * [*SHAPE[:2], height] + np.asarray(tall.first)
+    points = (np.asarray(GRID.lattice_m) + lattice * CELL_M).astype(np.float32)
+    sigma_m, all_of_them = np.full(3000, 0.02, np.float32), np.ones(3000, bool)
+    so_far = gather(tall, points[::-1] + np.float32(0.01), sigma_m, all_of_them)
+    before = replace(make_voxel_map(tall, (), surface=True), surface=so_far)
+    for offset, levels in ((0, height), (height - 2, 2), (height // 2, 3), (1, height - 1)):
+        window = replace(tall, first=tall.first + jnp.array([3, 2, offset]), shape=(5, 5, levels))
+        level = np.floor(lattice - np.asarray(window.first))
+        inside = ((level >= 0) & (level < window.shape)).all(axis=1)
+        after = add_heights(before, within(tall, window, points, sigma_m, all_of_them), window)
+        close(after, combine(so_far, gather(tall, points, sigma_m, inside)))
 
 
 def flat_map(height_m: float, count: int, noise_m: float = 0.01) -> VoxelMap:
@@ -77,9 +96,7 @@ def flat_map(height_m: float, count: int, noise_m: float = 0.01) -> VoxelMap:
     x, y = np.meshgrid(np.arange(8) * 0.1 + 0.05, np.arange(8) * 0.1 + 0.05)
     places = np.stack([x.ravel(), y.ravel(), np.full(64, height_m)], axis=-1).repeat(count, axis=0)
     places[:, 2] += rng.normal(0, noise_m, len(places))
-    heights = gather_heights(
-        grid, jnp.asarray(places, jnp.float32), jnp.full(len(places), 0.01), jnp.ones(len(places), bool)
-    )
+    heights = gather(grid, jnp.asarray(places, jnp.float32), jnp.full(len(places), 0.01), jnp.ones(len(places), bool))
     log_odds = jnp.zeros((1, 8, 8, 10)).at[0, :, :, 5].set(2.0)
     return replace(make_voxel_map(grid, ()), log_odds=log_odds, surface=heights)
 
@@ -113,4 +130,6 @@ def test_heights_are_stored_and_damage_to_them_is_found(tmp_path):
     read, _ = load_map(tmp_path / "map.zarr")
     np.testing.assert_array_equal(read.surface, ground.surface)
     with pytest.raises(JaxmapError, match="not finite"):
-        save_map(tmp_path / "map.zarr", replace(ground, surface=jnp.full((4, 8, 8), jnp.nan)), MapAttributes())
+        save_map(
+            tmp_path / "map.zarr", replace(ground, surface=jnp.full_like(ground.surface, jnp.nan)), MapAttributes()
+        )

@@ -11,12 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxmap.errors import UsageError
+from jaxmap.fusion.surface import combine, gather_heights, over_layers
 from jaxmap.geometry.bounds import site_lattice
 from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.merge import add_maps, check_alike, common_grid
 from jaxmap.mapping.store import MapReader, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import TileStore
-from jaxmap.types import make_grid, make_voxel_map, to_device
+from jaxmap.types import VoxelMap, make_grid, make_voxel_map, to_device
 
 CLASSES, SIZE_M = ("sand", "rock"), (0.1, 0.1, 0.2)
 SITES = (np.array([4000.03, 250.0, 12.1]), np.array([4003.37, 246.91, 11.3]))
@@ -29,7 +30,9 @@ def session(rng: np.random.Generator, site: np.ndarray, shape_m=(9, 8, 1)):
     grid = make_grid(corner_m, corner_m + shape_m, SIZE_M, site_lattice(site, SIZE_M))
     values = rng.normal(size=(3, *grid.shape)).astype(np.float32) * (rng.random(grid.shape) > 0.7)
     count = to_device(int(rng.integers(1, 9)), np.int32)
-    voxel_map = replace(make_voxel_map(grid, CLASSES), log_odds=values, frames_fused=count)
+    points = to_device(corner_m + rng.random((4000, 3)) * shape_m, np.float32)
+    heights = gather_heights(grid, grid, points, to_device(np.full(4000, 0.02)), to_device(np.ones(4000, bool), bool))
+    voxel_map = replace(make_voxel_map(grid, CLASSES), log_odds=values, frames_fused=count, surface=heights)
     return voxel_map, replace(ATTRIBUTES, site_origin=site)
 
 
@@ -37,7 +40,7 @@ def merged(path: Path, maps: list[MapReader]):
     names = [f"map {index}" for index in range(len(maps))]
     check_alike(maps, names)
     grid, shifts = common_grid(maps, names)
-    store = TileStore(path, grid, maps[0].classes)
+    store = TileStore(path, grid, maps[0].classes, surface=all(one.surface for one in maps))
     add_maps(maps, shifts, store)
     store.commit(sum(one.frames_fused for one in maps), maps[0].attributes)
     store.close()
@@ -67,8 +70,24 @@ def test_the_sum_holds_each_map_in_its_place(tmp_path_factory, seed):
         expected[part] += voxel_map.log_odds
         seen[part] += np.asarray(voxel_map.log_odds) != 0
     np.testing.assert_array_equal(whole.log_odds, expected)
+    check_heights(whole, sessions, corner_m)
     assert np.count_nonzero(expected) == np.count_nonzero(seen)
     assert int(whole.frames_fused) == sum(int(voxel_map.frames_fused) for voxel_map, _ in sessions)
+
+
+def check_heights(whole: VoxelMap, sessions, corner_m: np.ndarray) -> None:
+    """Columns of the sum hold the statistics of all, about the first site's origin."""
+    found = np.asarray(over_layers(whole.surface))
+    expected = np.zeros(found.shape, np.float32)
+    for voxel_map, attributes in sessions:
+        own = np.array(over_layers(voxel_map.surface))
+        own[2] += np.where(own[1] > 0, attributes.site_origin[2] - SITES[0][2], 0)
+        part = (slice(None), *where(voxel_map, attributes.site_origin, corner_m)[:2])
+        expected[part] = combine(expected[part], own)
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
+    np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
+    np.testing.assert_allclose(found[3], expected[3], rtol=1e-3, atol=1e-2)
 
 
 def test_a_merged_map_can_be_merged_again_in_any_order(tmp_path):
@@ -79,6 +98,7 @@ def test_a_merged_map_can_be_merged_again_in_any_order(tmp_path):
     other = merged(tmp_path / "c.zarr", [maps[0], maps[2], maps[1]])
     np.testing.assert_array_equal(one.grid.first, other.grid.first)
     np.testing.assert_allclose(one.log_odds, other.log_odds, atol=1e-5)
+    np.testing.assert_allclose(over_layers(one.surface)[:3], over_layers(other.surface)[:3], rtol=1e-5, atol=1e-5)
 
 
 def changed(one: MapReader, **attributes) -> MapReader:

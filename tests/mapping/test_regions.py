@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from observed_scenes import CAMERA as scene_camera
 from observed_scenes import FARTHEST_M, HEIGHT_PX, VOXEL_M, WIDTH_PX, disparities, poses_along
+from same_maps import assert_same_bits
 
 from jaxmap.datasets.base import FrameRef
 from jaxmap.errors import FrameError
@@ -30,7 +31,7 @@ from jaxmap.mapping.sequence import PreparedFrame
 from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.mapping.store import load_map
 from jaxmap.mapping.tiles import TILE, whole_tiles
-from jaxmap.types import Frame, GridSpec, make_stereo_camera, to_device
+from jaxmap.types import Frame, GridSpec, VoxelMap, make_stereo_camera, to_device
 
 CAMERA = make_stereo_camera(**scene_camera, width_px=WIDTH_PX, height_px=HEIGHT_PX)
 LABELLER = make_plane_labeller(ROVER_CLASSES, PlaneOptions())
@@ -57,12 +58,13 @@ def mapper_of(grid: GridSpec, poses: np.ndarray):
     return make_mapper(CAMERA, grid, LABELLER, RULE, (0.3, FARTHEST_M), T_world_camera=poses)
 
 
-def in_one_piece(seen: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def in_one_piece(seen: np.ndarray, poses: np.ndarray) -> VoxelMap:
     mapper = mapper_of(grid_of(poses), poses)
     voxel_map = mapper.init()
     for disparity_px, pose in zip(seen, poses, strict=True):
         voxel_map, _ = mapper.step(voxel_map, frame(disparity_px, pose), PARAMS, KEY)
-    return np.asarray(voxel_map.log_odds)
+    assert voxel_map.surface is not None and voxel_map.surface.any()
+    return voxel_map
 
 
 class InRegions:
@@ -78,7 +80,7 @@ class InRegions:
         """Writes the map, with what can stay of an old one, and returns how many frames were fused for it."""
         kept = None
         if old is not None and (record := read_record(old)) is not None:
-            kept = kept_tiles(old, record, self.sources, self.grid)
+            kept = kept_tiles(old, record, self.sources, self.grid, surface=True)
         left = {tile: frames for tile, frames in self.touching.items() if kept is None or tile not in kept.done}
         mapper = mapper_of(replace(self.grid, shape=shape), self.poses)
         files = {} if kept is None else dict(kept.files)
@@ -92,7 +94,7 @@ class InRegions:
             write_part(parts / f"{number}", fused, region.tiles, {})
             files |= part_tiles(parts / f"{number}")
         record = TileRecord("run", self.sources, set(), {})
-        assemble_map(path, self.grid, ROVER_CLASSES, len(self.names), DONE, files, record)
+        assemble_map(path, self.grid, ROVER_CLASSES, len(self.names), DONE, files, record, surface=True)
         return sum(len(region.frames) for region in regions)
 
 
@@ -116,7 +118,7 @@ def test_regions_of_any_size_give_the_bits_of_the_map_in_one_piece(tmp_path_fact
     folder, run = tmp_path_factory.mktemp("regions"), scene(seed)
     run.map(folder / "map.zarr", shape_of(run, tiles), folder / "parts")
     found, _ = load_map(folder / "map.zarr")
-    np.testing.assert_array_equal(found.log_odds, in_one_piece(run.seen, run.poses))
+    assert_same_bits(found, in_one_piece(run.seen, run.poses))
     assert int(found.frames_fused) == len(run.names)
 
 
@@ -134,7 +136,7 @@ def test_corrected_poses_give_the_bits_of_mapping_anew(tmp_path_factory, seed, m
     shape = shape_of(again, (2, 2, 1))
     fused = again.map(folder / "new.zarr", shape, folder / "new", old=folder / "old.zarr")
     again.map(folder / "anew.zarr", shape, folder / "anew")
-    np.testing.assert_array_equal(load_map(folder / "new.zarr")[0].log_odds, load_map(folder / "anew.zarr")[0].log_odds)
+    assert_same_bits(load_map(folder / "new.zarr")[0], load_map(folder / "anew.zarr")[0])
     if not moved:
         assert not fused
     elif len(moved) == 1 and size_m < 0.1 and again.grid.shape == run.grid.shape:
@@ -142,20 +144,22 @@ def test_corrected_poses_give_the_bits_of_mapping_anew(tmp_path_factory, seed, m
 
 
 @pytest.mark.slow
-def test_tiles_that_are_damaged_or_missing_are_named_and_fused_again(tmp_path):
+@pytest.mark.parametrize("array", ["log_odds", "surface"])
+def test_tiles_that_are_damaged_or_missing_are_named_and_fused_again(tmp_path, array):
     run = scene(5)
     shape = shape_of(run, (2, 2, 1))
     run.map(tmp_path / "old.zarr", shape, tmp_path / "old")
-    files = sorted((tmp_path / "old.zarr" / "log_odds" / "c" / "0").rglob("*"))
+    files = sorted((tmp_path / "old.zarr" / array / "c" / "0").rglob("*"))
     files = [file for file in files if file.is_file()]
     files[0].write_bytes(files[0].read_bytes()[:-9])
     files[1].unlink()
     record = read_record(tmp_path / "old.zarr")
     assert record is not None
-    kept = kept_tiles(tmp_path / "old.zarr", record, run.sources, run.grid)
+    kept = kept_tiles(tmp_path / "old.zarr", record, run.sources, run.grid, surface=True)
     assert sorted(kept.lost.values()) == ["is damaged", "is missing"]
+    assert not kept_tiles(tmp_path / "old.zarr", record, run.sources, run.grid, surface=False).done
     run.map(tmp_path / "new.zarr", shape, tmp_path / "new", old=tmp_path / "old.zarr")
-    np.testing.assert_array_equal(load_map(tmp_path / "new.zarr")[0].log_odds, in_one_piece(run.seen, run.poses))
+    assert_same_bits(load_map(tmp_path / "new.zarr")[0], in_one_piece(run.seen, run.poses))
 
 
 def test_every_tile_that_a_frame_touches_is_in_one_region_with_all_its_frames():

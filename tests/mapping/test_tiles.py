@@ -12,38 +12,51 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from same_maps import assert_same_bits
 
 from jaxmap.errors import JaxmapError
+from jaxmap.fusion.surface import add_heights, gather_heights
 from jaxmap.geometry.bounds import site_lattice, view_boxes
 from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.store import load_map, open_map, save_map
+from jaxmap.mapping.tile_arrays import TileValues
 from jaxmap.mapping.tiles import TILE, MovingBlock, TileStore, block_shape, tiles_of, whole_tiles
-from jaxmap.types import make_grid, make_stereo_camera, make_voxel_map
+from jaxmap.types import VoxelMap, make_grid, make_stereo_camera, make_voxel_map, to_device
 
 CLASSES = ("sand", "rock")
 GRID = whole_tiles(make_grid([-7, 3, -1], [12, 20, 2], (0.1, 0.1, 0.2), np.zeros(3)))
 DONE = MapAttributes(progress={"complete": True})
 
 
-def random_tile(rng: np.random.Generator) -> np.ndarray:
-    return rng.normal(size=(3, *TILE)).astype(np.float32)
+def random_tile(rng: np.random.Generator) -> TileValues:
+    """A tile with evidence, and heights in some of its columns."""
+    heights = rng.normal(size=(4, *TILE[:2], 1)) * (rng.random(TILE[:2]) < 0.5)[None, ..., None]
+    return TileValues(rng.normal(size=(3, *TILE)).astype(np.float32), heights.astype(np.float32))
+
+
+def same(found: TileValues | None, expected: TileValues) -> None:
+    assert found is not None
+    for name, values in expected._asdict().items():
+        np.testing.assert_array_equal(getattr(found, name), values)
 
 
 def store_at(path: Path) -> TileStore:
-    return TileStore(path, GRID, CLASSES)
+    return TileStore(path, GRID, CLASSES, surface=True)
 
 
 def test_tiles_read_back_before_and_after_the_commit_and_the_map_is_a_map(tmp_path):
     store, tile = store_at(tmp_path / "map.zarr"), random_tile(np.random.default_rng(0))
     store.write((1, 2, 0), tile)
-    np.testing.assert_array_equal(store.read((1, 2, 0)), tile)
+    same(store.read((1, 2, 0)), tile)
     assert store.read((0, 0, 0)) is None
     store.commit(7, DONE)
-    np.testing.assert_array_equal(store_at(store.path).read((1, 2, 0)), tile)
+    same(store_at(store.path).read((1, 2, 0)), tile)
     whole, _ = load_map(store.path)
     assert int(whole.frames_fused) == 7
-    np.testing.assert_array_equal(whole.log_odds[:, 64:128, 128:192, :16], tile)
-    assert np.count_nonzero(whole.log_odds) == np.count_nonzero(tile)
+    for values, expected in ((whole.log_odds[..., :16], tile.log_odds), (whole.surface[..., :1], tile.surface)):
+        np.testing.assert_array_equal(values[:, 64:128, 128:192], expected)
+    assert np.count_nonzero(whole.log_odds) == np.count_nonzero(tile.log_odds)
+    assert np.count_nonzero(whole.surface) == np.count_nonzero(tile.surface)
 
 
 def test_what_was_not_committed_is_not_there(tmp_path):
@@ -54,11 +67,11 @@ def test_what_was_not_committed_is_not_there(tmp_path):
     store.write((0, 0, 0), random_tile(rng))
     store.write((1, 1, 1), random_tile(rng))
     again = store_at(store.path)
-    np.testing.assert_array_equal(again.read((0, 0, 0)), first)
+    same(again.read((0, 0, 0)), first)
     assert again.tiles() == {(0, 0, 0)}
 
 
-@pytest.mark.parametrize("steps", range(8))
+@pytest.mark.parametrize("steps", range(12))
 def test_a_commit_that_is_cut_off_anywhere_is_carried_out_or_undone(tmp_path, monkeypatch, steps):
     store, rng = store_at(tmp_path / "map.zarr"), np.random.default_rng(0)
     old, new = ([random_tile(rng) for _ in range(2)] for _ in range(2))
@@ -67,7 +80,7 @@ def test_a_commit_that_is_cut_off_anywhere_is_carried_out_or_undone(tmp_path, mo
     store.commit(1, DONE)
     for index, tile in enumerate(new):
         store.write((index, 0, 0), tile)
-    store.write((1, 0, 0), np.zeros_like(new[1]))
+    store.write((1, 0, 0), store.empty())
     left, replacing, unlinking = [steps], os.replace, os.unlink
 
     def cut_off(name, function):
@@ -89,7 +102,7 @@ def test_a_commit_that_is_cut_off_anywhere_is_carried_out_or_undone(tmp_path, mo
     expected = {1: {(0, 0, 0): old[0], (1, 0, 0): old[1]}, 2: {(0, 0, 0): new[0]}}[count]
     assert again.tiles() == expected.keys()
     for index, tile in expected.items():
-        np.testing.assert_array_equal(again.read(index), tile)
+        same(again.read(index), tile)
     load_map(store.path)
 
 
@@ -103,6 +116,7 @@ def test_a_block_that_moves_gives_the_map_of_the_whole_grid(tmp_path_factory, se
     assert np.prod(shape) < np.prod(GRID.shape)
     block = MovingBlock(store_at(path), shape)
     here, dense = block.begin(0), np.zeros((3, *GRID.shape), np.float32)
+    whole = make_voxel_map(GRID, CLASSES, surface=True)
     for number in range(6):
         start = np.array([rng.integers(0, size - n + 1) for size, n in zip(GRID.shape, window, strict=True)])
         box = np.asarray(GRID.first) + np.stack([start, start + window])
@@ -113,13 +127,24 @@ def test_a_block_that_moves_gives_the_map_of_the_whole_grid(tmp_path_factory, se
         low = box[0] - np.asarray(here.grid.first)
         inside = tuple(slice(a, a + n) for a, n in zip(low, window, strict=True))
         here = replace(here, log_odds=here.log_odds.at[(slice(None), *inside)].add(added))
+        points = (box[0] + rng.random((500, 3)) * window) * [0.1, 0.1, 0.2]
+        here, whole = with_points(here, points, box), with_points(whole, points, box)
         dense[(slice(None), *(slice(a, a + n) for a, n in zip(start, window, strict=True)))] += added
         if number == 3:
             block.write_changes(here)
             block.store.commit(number, DONE)
     block.write_changes(here)
     block.store.commit(6, DONE)
-    np.testing.assert_array_equal(load_map(path)[0].log_odds, dense)
+    assert_same_bits(load_map(path)[0], replace(whole, log_odds=dense))
+
+
+def with_points(voxel_map: VoxelMap, points: np.ndarray, box: np.ndarray) -> VoxelMap:
+    """The map with the heights of points that lie in a box of voxels."""
+    x, y, z = (box[1] - box[0]).tolist()
+    window = replace(GRID, first=to_device(box[0], np.int32), shape=(x, y, z))
+    sigma_m, keep = to_device(np.full(len(points), 0.02)), to_device(np.ones(len(points), bool), bool)
+    heights = gather_heights(voxel_map.grid, window, to_device(points, np.float32), sigma_m, keep)
+    return replace(voxel_map, surface=add_heights(voxel_map, heights, window))
 
 
 @pytest.mark.parametrize("margin", [0, 3])
@@ -155,7 +180,9 @@ def test_a_damaged_tile_is_named(tmp_path):
 def test_a_map_of_another_form_is_not_written_over(tmp_path):
     store_at(tmp_path / "map.zarr").commit(1, DONE)
     with pytest.raises(JaxmapError, match="the run needs"):
-        TileStore(tmp_path / "map.zarr", replace(GRID, shape=(64, 64, 16)), CLASSES)
+        TileStore(tmp_path / "map.zarr", replace(GRID, shape=(64, 64, 16)), CLASSES, surface=True)
+    with pytest.raises(JaxmapError, match="the run needs .* without heights"):
+        TileStore(tmp_path / "map.zarr", GRID, CLASSES)
 
 
 @given(

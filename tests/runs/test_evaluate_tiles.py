@@ -13,6 +13,7 @@ from truth_files import CRS, SITE, write_raster
 from jaxmap.evaluation import cells
 from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.store import load_map, save_map
+from jaxmap.mapping.tile_arrays import TileValues
 from jaxmap.mapping.tiles import TILE, TileStore, whole_tiles
 from jaxmap.runs import evaluation
 from jaxmap.types import make_grid
@@ -31,7 +32,7 @@ def store_map(path: Path) -> None:
         values[0, ..., 2] = 2 * seen
         values[1, ..., 2] = seen * rng.normal(np.where(rock, -2, 2), 1)
         values[2, ..., 2] = seen * rng.normal(np.where(rock, 2, -2), 1)
-        store.write(tile, values)
+        store.write(tile, TileValues(values))
     store.commit(1, MapAttributes(crs=CRS, site_origin=SITE))
     store.close()
 

@@ -13,8 +13,13 @@ from truth_files import SITE, write_map
 
 from jaxmap.commands.main import main
 from jaxmap.datasets.poses import read_poses
-from jaxmap.mapping.store import load_map, save_map
+from jaxmap.fusion.surface import over_layers
+from jaxmap.mapping.store import load_map, open_map, save_map
+from jaxmap.planning.options import RoverOptions
+from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.merging import open_sessions
+from jaxmap.runs.planning import read_costs
+from jaxmap.runs.run_frames import read_frame_table, read_run_frames
 
 SEEN = np.ones((20, 12), bool)
 CAMERA = {"fx_px": 60, "fy_px": 60, "cx_px": 39.5, "cy_px": 29.5, "width_px": 80, "height_px": 60}
@@ -85,17 +90,41 @@ def test_halves_of_a_sequence_merged_are_the_whole(cli, scene_folder, tmp_path):
     once = (np.asarray(early.log_odds) == 0) | (np.asarray(late.log_odds) == 0)
     np.testing.assert_array_equal(sums[once], np.asarray(whole.log_odds)[once])
     assert int(merged.frames_fused) == 6 and once.mean() > 0.5
+    heights, others = (np.asarray(over_layers(one.surface)) for one in (whole, merged))
+    np.testing.assert_allclose(others[(slice(None), *part[:2])][:3], heights[:3], rtol=1e-4, atol=1e-4)
+    merged_run = RunFolder(tmp_path / "merged")
+    assert read_run_frames(merged_run, np.zeros(3)).index.tolist() == list(range(6))
+    assert_same_hazards(tmp_path / "merged" / "map.zarr", tmp_path / "whole" / "map.zarr")
+    ours, theirs = (read_costs(tmp_path / name, RoverOptions()) for name in ("merged", "whole"))
+    assert ours.site.fine and np.isfinite(theirs.hazards.slope_deg).any()
+    np.testing.assert_allclose(ours.hazards.slope_deg[part[:2]], theirs.hazards.slope_deg, rtol=1e-2, atol=1e-2)
+    for words in (("report",), ("view", "--save", tmp_path / "f.rrd")):
+        outcome = cli(words[0], tmp_path / "merged", *words[1:])
+        assert outcome.status == 0, outcome.err
+
+
+def assert_same_hazards(found: Path, expected: Path) -> None:
+    """Whatever order their heights were added up in."""
+    (_, theirs), reader = load_map(expected), open_map(found)
+    ours = reader.layers(reader.whole)
+    assert ours.keys() == theirs.layers.keys() and len(ours)
+    for name, values in theirs.layers.items():
+        known, other = values[np.isfinite(values)], ours[name][np.isfinite(ours[name])]
+        assert len(known) == len(other) and len(known)
+        np.testing.assert_allclose(np.sort(other), np.sort(known), rtol=1e-2, atol=1e-2)
 
 
 def test_times_that_overlap_are_told(runs, tmp_path):
-    from jaxmap.runs.folder import RunFolder
     from jaxmap.runs.merging import _write_poses
 
     write_run(tmp_path / "c", 100.5)
     (tmp_path / "out").mkdir()
-    notes = _write_poses(open_sessions([*runs, tmp_path / "c"]), RunFolder(tmp_path / "out"))
+    notes = _write_poses(open_sessions([*runs, tmp_path / "c"]), [0, 2, 4], RunFolder(tmp_path / "out"))
     assert len(notes) == 1 and "the times of" in notes[0] and "1.500 s later" in notes[0]
     assert read_poses(tmp_path / "out" / "poses.tum").timestamps_s.tolist() == [50, 51, 100, 101, 102, 103]
+    rows = read_frame_table(RunFolder(tmp_path / "out"), 6)
+    assert [(row.frame, row.timestamp_s) for row in rows][::3] == [(2, 50.0), (1, 101.0)]
+    assert rows[-1] == (5, "c/000001", 103.0, "")
 
 
 def test_what_cannot_be_merged_is_one_line(cli, runs, tmp_path):

@@ -15,6 +15,7 @@ import pytest
 from fixtures import FRAMES, cli, finished_run, map_words, scene_copy, scene_folder, shared_cache  # noqa: F401
 from killed import SLOW_DISK, kill_when
 from planned_runs import config_of, log_odds, metrics_of, planned
+from same_maps import assert_same_bits, assert_same_layers
 from scenes import write_folder_sequence
 
 from jaxmap.errors import JaxmapError
@@ -401,8 +402,7 @@ def test_a_map_in_tiles_has_the_bits_of_the_whole_one(scene_folder, tmp_path, in
         run_plan(plan, tiled, strict=True, checkpoint_every_s=0.0, notify=print, report=False)
     expected, _ = load_map(folder.map)
     found, _ = load_map(tiled.map)
-    offset = np.asarray(expected.grid.first) - np.asarray(found.grid.first)
-    part = tuple(slice(a, a + n) for a, n in zip(offset, expected.grid.shape, strict=True))
-    inside = np.asarray(found.log_odds)[(slice(None), *part)]
-    np.testing.assert_array_equal(inside, expected.log_odds)
+    assert_same_bits(found, expected)
+    assert found.surface is not None and found.surface.any()
     assert open_map(tiled.map).attributes.progress["complete"]
+    assert_same_layers(tiled.map, folder.map)

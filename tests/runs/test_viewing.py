@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import json
 from pathlib import Path
 
@@ -12,17 +13,21 @@ from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_runs import SITE, add_cameras, make_run
+from PIL import Image
 
 from jaxmap.datasets.base import FrameRef
 from jaxmap.datasets.poses import read_poses, write_tum
 from jaxmap.errors import JaxmapError
+from jaxmap.labels import class_colours
+from jaxmap.mapping.observations import Observation, ObservationAttributes, write_attributes, write_observation
 from jaxmap.report.first_seen import first_seen
 from jaxmap.report.recording import check_viewer, recording
 from jaxmap.report.run_contents import read_run
 from jaxmap.runs.folder import RunFolder
-from jaxmap.runs.run_frames import read_run_frames, write_frame_table
+from jaxmap.runs.run_frames import read_run_frames, rows_of, write_frame_table
 from jaxmap.types import Pinhole
 
+SMALL = dict(fx_px=30.0, fy_px=30.0, cx_px=19.5, cy_px=14.5, baseline_m=0.3, width_px=40.0, height_px=30.0)
 CAMERA, SIZE_PX = Pinhole(50.0, 50.0, 31.5, 23.5, 0.1, 0.0), (64, 48)
 
 
@@ -45,11 +50,11 @@ def run(tmp_path) -> Path:
     local = T - np.pad(SITE[:, None], ((0, 1), (3, 0)))
     metrics["camera"]["key_frames"] = {"000000": local[0].tolist(), "000020": local[-1].tolist()}
     (run / "metrics.json").write_text(json.dumps(metrics))
-    write_frame_table(run / "frames.csv", frame_names(21), {"left, 19": 'it is "black"'})
+    write_frame_table(run / "frames.csv", rows_of(frame_names(21), {"left, 19": 'it is "black"'}))
     return run
 
 
-def rows_of(path: Path) -> dict[str, list[dict]]:
+def logged(path: Path) -> dict[str, list[dict]]:
     """The rows of each entity of a recording, as rerun reads them."""
     reader = pytest.importorskip("rerun.chunk").RrdReader(path)
     assert len(reader.recordings()) == 1 and len(reader.blueprints()) == 1
@@ -106,7 +111,7 @@ def test_a_run_becomes_a_recording(cli, run, tmp_path) -> None:
     outcome = cli("view", run, "--save", tmp_path / "f.rrd")
     assert outcome.status == 0, outcome.err
     assert "20 poses; pictures (left, labels, disparity) of 2 key frames" in outcome.err
-    rows = rows_of(tmp_path / "f.rrd")
+    rows = logged(tmp_path / "f.rrd")
     poses = sorted((row["frame"], row["Transform3D:translation"][0]) for row in rows["/world/camera"])
     assert [frame for frame, _ in poses] == [*range(19), 20]
     np.testing.assert_allclose(poses[0][1], [-3, 0, 1.2], atol=1e-5)
@@ -130,11 +135,37 @@ def test_a_run_becomes_a_recording(cli, run, tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_frames_between_key_frames_show_what_was_perceived(cli, run, tmp_path) -> None:
+    pytest.importorskip("rerun")
+    # In the order of the classes that are kept, which is not the map's.
+    kept = ObservationAttributes(
+        "s", "s", "folder", dict(SMALL), {}, "files", "labels", (30, 40), ("rock", "other", "sand")
+    )
+    write_attributes(run / "observations.zarr", kept)
+    disparity_px, labels = np.full((30, 40), 5.0, np.float32), np.zeros((30, 40), np.uint8)
+    labels[:, 20:] = 255
+    for name, time_s in (("left, 0", 100.0), ("left, 7", 107.0), ("left, 9", 109.0)):
+        seen = Observation(name, time_s, np.eye(4), disparity_px, labels)
+        write_observation(run / "observations.zarr", seen, "labels")
+    outcome = cli("view", run, "--save", tmp_path / "f.rrd")
+    assert outcome.status == 0, outcome.err
+    assert "disparity and likeliest classes of 2 other frames" in outcome.err
+    rows = logged(tmp_path / "f.rrd")
+    for entity in ("/labels", "/disparity"):
+        assert sorted({row["frame"] for row in rows[entity] if row.get("EncodedImage:blob")}) == [0, 7, 9, 20]
+    assert {row["frame"] for row in rows["/world/camera/left"] if "Clear:is_recursive" in row} == {7, 9}
+    [blob] = next(row["EncodedImage:blob"] for row in rows["/labels"] if row["frame"] == 7)
+    picture = np.asarray(Image.open(io.BytesIO(bytes(blob))).convert("RGB"), int)
+    rock = class_colours(read_run(run).classes)[read_run(run).classes.index("rock")]
+    assert np.abs(picture[10, 5] - rock).max() < 12 and picture[10, 35].max() < 12
+
+
+@pytest.mark.slow
 def test_a_run_from_before_says_what_it_shows(cli, run, tmp_path) -> None:
     pytest.importorskip("rerun")
     (run / "frames.csv").unlink()
     assert cli("view", run, "--save", tmp_path / "f.rrd").status == 0
-    pictures = rows_of(tmp_path / "f.rrd")["/labels"]
+    pictures = logged(tmp_path / "f.rrd")["/labels"]
     assert sorted({row["frame"] for row in pictures}) == [0, 19], "by where they were taken"
     metrics = json.loads((run / "metrics.json").read_text())
     del metrics["camera"]
@@ -143,7 +174,7 @@ def test_a_run_from_before_says_what_it_shows(cli, run, tmp_path) -> None:
     assert outcome.status == 0, outcome.err
     for remark in ("no frames.csv", "metrics.json does not tell the camera", "all from the first frame on"):
         assert remark in outcome.err
-    assert [name for name in rows_of(tmp_path / "f.rrd") if name.startswith("/world/voxels/")] == [
+    assert [name for name in logged(tmp_path / "f.rrd") if name.startswith("/world/voxels/")] == [
         "/world/voxels/000000"
     ]
 
@@ -169,13 +200,13 @@ def test_what_is_interrupted_leaves_a_file_and_what_fails_none(tmp_path) -> None
     pytest.importorskip("rerun")
 
     def record(path: Path, fault: BaseException) -> None:
-        with pytest.raises(type(fault)), recording("name", ("sand",), path) as log:
+        with pytest.raises(type(fault)), recording("name", ("sand",), np.eye(4)[None], path) as log:
             log.at(3, 2.0)
             log.pose(np.eye(4))
             raise fault
 
     record(tmp_path / "stopped.rrd", KeyboardInterrupt())
-    assert rows_of(tmp_path / "stopped.rrd")["/world/camera"][0]["frame"] == 3
+    assert logged(tmp_path / "stopped.rrd")["/world/camera"][0]["frame"] == 3
     record(tmp_path / "failed.rrd", ValueError())
     assert [path.name for path in tmp_path.iterdir()] == ["stopped.rrd"]
 
@@ -185,7 +216,7 @@ def test_a_run_is_recorded_while_it_goes_on(cli, scene_folder, tmp_path) -> None
     pytest.importorskip("rerun")
     outcome = cli(*map_words(scene_folder, tmp_path / "run", "--view-save", tmp_path / "live.rrd"))
     assert outcome.status == 0, outcome.err
-    rows = rows_of(tmp_path / "live.rrd")
+    rows = logged(tmp_path / "live.rrd")
     assert sorted(row["frame"] for row in rows["/world/camera"]) == [*range(6)]
     assert len(rows["/disparity"]) == len(rows["/labels"]) == 6
     last = max(rows["/world/voxels/map"], key=lambda row: row["frame"])
