@@ -132,7 +132,7 @@ def map_pixels(
         some = jnp.pad(wanted, ((0, missing), (0, 0))).reshape(len(rows.starts), -1).any(axis=1)
         forms = jax.eval_shape(block, *jax.tree.map(lambda leaf: leaf[0], bands))
 
-        def zeros(*band: Array) -> tuple[Array, ...]:
+        def zeros(*band: Array | None) -> tuple[Array, ...]:
             return tuple(jnp.zeros(form.shape, form.dtype) for form in forms)
 
         images = jax.lax.map(lambda one: jax.lax.cond(one[0], block, zeros, *one[1]), (some, bands))
