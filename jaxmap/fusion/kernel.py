@@ -66,7 +66,8 @@ def _differentiated(
     def plain(*moved: Array) -> tuple[VoxelMap, Counted]:
         those = dict(zip(moving, moved, strict=True))
         arguments = [those.get(index, leaf) for index, leaf in enumerate(leaves)]
-        return add_plainly(*jax.tree.unflatten(form, arguments), rule, depth_range_m)
+        voxel_map, sighting, window, params = jax.tree.unflatten(form, arguments)
+        return add_plainly(voxel_map, sighting, window, params, rule, depth_range_m)
 
     return jax.jvp(plain, [leaves[index] for index in moving], [changes[index] for index in moving])
 
