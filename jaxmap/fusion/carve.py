@@ -12,7 +12,7 @@ from jaxmap.geometry.camera import depth_sigma, points_to_pixels, transform_poin
 from jaxmap.geometry.grid import voxel_centres
 from jaxmap.types import GridSpec, StereoCamera
 
-_MARGIN_SIGMAS = 2.0
+MARGIN_SIGMAS = 2.0
 
 
 def carve(
@@ -48,7 +48,7 @@ def carve(
         pixel = jnp.where(in_view, row * width + column, 0.0).astype(jnp.int32)
         measured_m = jnp.where(valid, depth_m, 0.0).reshape(-1)[pixel]
         voxel_depth_m = centres_camera[..., 2]
-        margin_m = 0.5 * jnp.linalg.norm(grid.voxel_size_m) + _MARGIN_SIGMAS * depth_sigma(
+        margin_m = 0.5 * jnp.linalg.norm(grid.voxel_size_m) + MARGIN_SIGMAS * depth_sigma(
             camera, measured_m, params.disparity_sigma_px
         )
         seen_through = voxel_depth_m + margin_m < measured_m

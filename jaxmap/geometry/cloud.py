@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
@@ -55,9 +56,11 @@ def project(
     points_camera, valid = disparity_to_points(camera, disparity_px)
     depth_m = points_camera[..., 2]
     in_range = valid & (depth_m >= depth_range_m[0]) & (depth_m <= depth_range_m[1])
-    points_world = transform_points(T_world_camera, points_camera).reshape(-1, 3)
-    # Kept apart: each reader would compute the points anew, one by one.
-    points_world, depth_m, in_range = jax.lax.optimization_barrier((points_world, depth_m, in_range))
+    points_world = transform_points(T_world_camera, points_camera)
+    columns = [points_world[..., axis].reshape(-1) for axis in range(3)]
+    # Kept apart: each reader would compute the points anew, one by one. In columns, for readers of columns.
+    columns, depth_m, in_range = jax.lax.optimization_barrier((columns, depth_m, in_range))
+    points_world = jnp.stack(columns, axis=-1)
     relief = None
     if ground is not None:
         up_camera = T_world_camera.rotation().as_matrix()[2]

@@ -55,9 +55,9 @@ class PointFeatures(NamedTuple):
 
     Attributes:
         keep: points to fuse.
-        map: applies a pointwise function to the features and gives its arrays (N,). The features need never be held
-            all at once. Further features, where they are given, follow the labeller's own: an image (h, w, E) of
-            relief, whose pixels are `RELIEF_STRIDE` of the frame's wide.
+        map: applies a pointwise function to the features and gives its arrays (N,), which mean something at points in
+            range. The features need never be held all at once. Further features, where they are given, follow the
+            labeller's own: an image (h, w, E) of relief, whose pixels are `RELIEF_STRIDE` of the frame's wide.
         of_frame: a pytree of the whole frame.
     """
 

@@ -162,7 +162,9 @@ def make_logits_labeller(
 
         def map_rows(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
             with jax.named_scope("pixel_labels"):
-                return tuple(image.reshape(-1) for image in map_pixels(function, coarse, places, more, RELIEF_STRIDE))
+                # The sky, and what lies too far: a third of many images.
+                images = map_pixels(function, coarse, places, more, RELIEF_STRIDE, cloud.in_range)
+                return tuple(image.reshape(-1) for image in images)
 
         return PointFeatures(keep, map_rows, of_frame)
 

@@ -19,11 +19,19 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxmap.errors import JaxmapError, UsageError
-from jaxmap.fusion.integrate import add_evidence
-from jaxmap.fusion.surface import add_heights
+from jaxmap.fusion.frame import add_evidence_of, evidence_of
 from jaxmap.host.stages import timed_stage
 from jaxmap.mapping.sequence import Cover, FusedFrame, PreparedFrame, run_sequence, timed_frames
-from jaxmap.mapping.step import Mapper, MapperParams, StepReport, check_inputs, compile_step, see_frame, with_step
+from jaxmap.mapping.step import (
+    Mapper,
+    MapperParams,
+    StepReport,
+    check_inputs,
+    compile_step,
+    report_of,
+    see_frame,
+    with_step,
+)
 from jaxmap.types import Frame, VoxelMap, to_device
 
 Device = Any
@@ -83,15 +91,14 @@ def on_devices(mapper: Mapper, devices: Sequence[Device]) -> Mapper:
         check_inputs(design, frame, params)
         frame_key = jax.random.fold_in(key, voxel_map.frames_fused + jax.lax.axis_index(_AXIS))
         seen = see_frame(design, voxel_map.grid, frame, params, frame_key)
-        evidence, first, heights = jax.lax.all_gather((seen.evidence, seen.window.first, seen.heights), _AXIS)
+        own = evidence_of(seen.sighting, voxel_map.grid, seen.window, params.fusion, design.rule, design.depth_range_m)
+        all_evidence, first = jax.lax.all_gather((own, seen.window.first), _AXIS)
         fused = voxel_map
         for index in range(len(devices)):
-            window = replace(seen.window, first=first[index])
-            fused = add_evidence(fused, evidence[index], window)
-            if fused.surface is not None and heights is not None:
-                fused = replace(fused, surface=add_heights(fused, heights[index], window))
+            evidence = jax.tree.map(lambda leaf, index=index: leaf[index], all_evidence)
+            fused = add_evidence_of(fused, evidence, replace(seen.window, first=first[index]))
         fused = replace(fused, frames_fused=voxel_map.frames_fused + batch.used)
-        return fused, jax.tree.map(lambda leaf: leaf[None], seen.report)
+        return fused, jax.tree.map(lambda leaf: leaf[None], report_of(seen, own.counted))
 
     sharded = jax.shard_map(
         fuse,

@@ -12,17 +12,17 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from jaxmap.ensemble.draws import EnsembleParams
 from jaxmap.ensemble.members import fuse_members
 from jaxmap.errors import JaxmapError
-from jaxmap.fusion.carve import carve
-from jaxmap.fusion.integrate import add_evidence, count_points
+from jaxmap.fusion.frame import Counted, Sighting
+from jaxmap.fusion.kernel import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
-from jaxmap.fusion.surface import add_heights, gather_heights, height_sigma
+from jaxmap.fusion.sensor_model import point_weights
+from jaxmap.fusion.surface import height_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
@@ -30,7 +30,7 @@ from jaxmap.labels import IGNORE
 from jaxmap.matching.design import MatchDesign, MatchParams
 from jaxmap.matching.match import match
 from jaxmap.matching.rectify import RawPair, rectify_pair, rectifying_rotations
-from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_voxel_map
+from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -104,20 +104,17 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
     return exact
 
 
-class FrameEvidence(NamedTuple):
-    """What one frame says, before it is added to a map.
+class SeenFrame(NamedTuple):
+    """What one frame shows, before it is added to a map: its labelled points, and the window of the map they lie in.
 
-    `evidence` is that of the voxels of `window`; `frame` is itself, matched, and `camera` sees it; `labels` are those
-    that its points are fused with; `heights` are the statistics of the columns of the window, where they are kept.
+    `frame` is itself, matched.
     """
 
-    evidence: Float[Array, "C1 X Y Z"]
+    sighting: Sighting
     window: GridSpec
     frame: Frame
-    camera: StereoCamera
-    labels: PointLabels
-    report: StepReport
-    heights: Float[Array, "4 X Y L"] | None = None
+    in_range: Int[Array, ""]
+    estimate: PyTree
 
 
 @in_full_float32
@@ -126,24 +123,24 @@ def fuse_frame(
 ) -> tuple[VoxelMap, StepReport]:
     """The step itself: one frame into the map. `key` is the run's."""
     frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
-    seen = see_frame(design, voxel_map.grid, frame, params, frame_key)
-    fused = add_evidence(voxel_map, seen.evidence, seen.window)
+    seen, rule = see_frame(design, voxel_map.grid, frame, params, frame_key), design.rule
+    fused, counted = add_sighting(voxel_map, seen.sighting, seen.window, params.fusion, rule, design.depth_range_m)
     if design.members:
         assert params.ensemble is not None
-        rule, depth_range_m, shape = design.rule, design.depth_range_m, design.window_shape
-        camera, draws = seen.camera, params.ensemble
-        own = fuse_members(voxel_map, seen.frame, seen.labels, camera, draws, frame_key, rule, depth_range_m, shape)
+        depth_range_m, shape = design.depth_range_m, design.window_shape
+        camera, labels = seen.sighting.camera, seen.sighting.labels
+        own = fuse_members(
+            voxel_map, seen.frame, labels, camera, params.ensemble, frame_key, rule, depth_range_m, shape
+        )
         fused = replace(fused, members=own)
-    if voxel_map.surface is not None and seen.heights is not None:
-        fused = replace(fused, surface=add_heights(voxel_map, seen.heights, seen.window))
-    return fused, seen.report
+    return fused, report_of(seen, counted)
 
 
 @in_full_float32
 def see_frame(
     design: StepDesign, grid: GridSpec, frame: Frame, params: MapperParams, frame_key: PRNGKeyArray
-) -> FrameEvidence:
-    """What a frame says of the voxels of a grid that it can see: all of the step but the sum."""
+) -> SeenFrame:
+    """What a frame shows of a grid: all of the step but the sum over voxels."""
     labeller, rule, depth_range_m = design.labeller, design.rule, design.depth_range_m
     frame, camera = matched(design.match, frame, params)
     pose, fusion = frame.T_world_camera, params.fusion
@@ -152,28 +149,22 @@ def see_frame(
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
     labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
-    free = None
-    if rule.carve:
-        free = carve(camera, pose, cloud.depth_m, cloud.valid, window, fusion, depth_range_m)
     weights = point_weights(grid, cloud, rule)
-    counts = count_points(window, cloud.points_world, labels, weights, len(labeller.classes))
+    height_sigma_m = height_sigma(cloud, pose.translation()[2]) if rule.surface else None
+    sighting = Sighting(camera, pose, cloud.points_world, labels, weights, height_sigma_m, cloud.depth_m, cloud.valid)
+    return SeenFrame(sighting, window, frame, cloud.in_range.sum(), estimate)
 
-    heights = None
-    if rule.surface:
-        sigma_m = height_sigma(cloud, pose.translation()[2])
-        heights = gather_heights(grid, window, cloud.points_world, sigma_m, labels.keep)
 
-    hits, freed = _count_voxels(total_weight(counts) > 0, free)
-    report = StepReport(
-        points_valid=cloud.valid.sum(),
-        points_in_range=cloud.in_range.sum(),
-        points_kept=labels.keep.sum(),
-        voxels_hit=hits,
-        voxels_freed=freed,
-        estimate=estimate,
+def report_of(seen: SeenFrame, counted: Counted) -> StepReport:
+    """What the step says of a frame."""
+    return StepReport(
+        points_valid=seen.sighting.valid.sum(),
+        points_in_range=seen.in_range,
+        points_kept=seen.sighting.labels.keep.sum(),
+        voxels_hit=counted.hits,
+        voxels_freed=counted.freed,
+        estimate=seen.estimate,
     )
-    evidence = frame_evidence(counts, free, fusion, rule)
-    return FrameEvidence(evidence, window, frame, camera, labels, report, heights)
 
 
 def matched(design: MatchDesign | None, frame: Frame, params: MapperParams) -> tuple[Frame, StereoCamera]:
@@ -214,16 +205,6 @@ def rectified(design: MatchDesign, frame: Frame, params: MapperParams) -> tuple[
         baseline_m = jnp.linalg.norm(raw.T_right_left.translation())
     frame = replace(frame, T_world_camera=pose, image=left, right_image=right, blind=blind)
     return frame, replace(camera, baseline_m=baseline_m)
-
-
-def _count_voxels(
-    hits: Bool[Array, "X Y Z"], free: Bool[Array, "X Y Z"] | None
-) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """How many voxels hold points, and how many others were seen through."""
-    freed = jnp.zeros_like(hits) if free is None else free & ~hits
-    # Both in one sum, the second above 16 bits, and first along the short axis: thrice as fast as two sums.
-    both = (hits.astype(jnp.int32) + (freed.astype(jnp.int32) << 16)).sum(axis=2)
-    return (both & 0xFFFF).sum(), (both >> 16).sum()
 
 
 @in_full_float32

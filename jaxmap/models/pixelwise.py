@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxmap.errors import UsageError
 from jaxmap.models.architecture import Architecture
@@ -83,6 +83,7 @@ def map_pixels(
     places: Upsampling,
     more: Float[Array, "h2 w2 E"] | None = None,
     stride: int = 1,
+    wanted: Bool[Array, "H W"] | None = None,
 ) -> tuple[Array, ...]:
     """Applies a function to the logits at all pixels, a few rows at a time.
 
@@ -92,6 +93,7 @@ def map_pixels(
         places: where the pixels lie among them.
         more: further numbers of each pixel, which follow the logits: an image whose pixels are `stride` pixels wide.
         stride: a power of two, 16 at most.
+        wanted: pixels whose values are asked for; where a few rows have none, they are zeros. All by default.
 
     Returns:
         The images (H, W) that the function gives.
@@ -103,8 +105,7 @@ def map_pixels(
 
     # On the way back the logits are computed anew, so that they are never all held there either.
     @jax.checkpoint
-    def block(band: tuple[Int[Array, ""], Float[Array, "R near"], Array | None]) -> tuple[Array, ...]:
-        start, weights, beside = band
+    def block(start: Int[Array, ""], weights: Float[Array, "R near"], beside: Array | None) -> tuple[Array, ...]:
         near = jax.lax.dynamic_slice_in_dim(coarse, start, weights.shape[1])
         lines = jnp.einsum("Rn,ncw->Rcw", weights, near, precision=PRECISION)
         parts = [
@@ -123,7 +124,18 @@ def map_pixels(
         missing = len(rows.starts) * (_BLOCK_ROWS // stride) - len(more)
         more = jnp.swapaxes(jnp.pad(more, ((0, missing), (0, 0), (0, 0))), 1, 2)
         more = more.reshape(-1, _BLOCK_ROWS // stride, *more.shape[1:])
-    images = jax.lax.map(block, (jnp.asarray(rows.starts), jnp.asarray(rows.weights), more))
+    bands = (jnp.asarray(rows.starts), jnp.asarray(rows.weights), more)
+    if wanted is None:
+        images = jax.lax.map(lambda band: block(*band), bands)
+    else:
+        missing = len(rows.starts) * _BLOCK_ROWS - height
+        some = jnp.pad(wanted, ((0, missing), (0, 0))).reshape(len(rows.starts), -1).any(axis=1)
+        forms = jax.eval_shape(block, *jax.tree.map(lambda leaf: leaf[0], bands))
+
+        def zeros(*band: Array | None) -> tuple[Array, ...]:
+            return tuple(jnp.zeros(form.shape, form.dtype) for form in forms)
+
+        images = jax.lax.map(lambda one: jax.lax.cond(one[0], block, zeros, *one[1]), (some, bands))
     return tuple(image.reshape(-1, width)[:height] for image in images)
 
 

@@ -16,7 +16,7 @@ from jaxmap.native.build import TARGET
 
 STAGES = (
     *("project", "transform", "relief", "mlesac", "plane_labels", "network", "pixel_labels"),
-    *("view_window", "carve", "count_points", "frame_evidence", "add_evidence", "fuse_members"),
+    *("view_window", "fuse", "carve", "count_points", "frame_evidence", "add_evidence", "fuse_members"),
 )
 """The named scopes of the step, in its order."""
 

@@ -17,6 +17,7 @@ from harness import Amount, Case, Group, Peer, Run, usable_cores
 from scene import DEPTH_RANGE_M, DISPARITIES, VOXEL_M, Scene, grid_of, make_scene, moved_poses, write_sequence
 
 from jaxmap.datasets.calibration import read_camera_yaml
+from jaxmap.fusion.frame import add_plainly
 from jaxmap.host.files import config_folder
 from jaxmap.stereo.match import Matcher, StereoOptions
 from jaxmap.stereo.rectify import StereoRig, make_rectifier, make_stereo_rig, rectify_image
@@ -188,6 +189,7 @@ def fuse(size: str) -> Case:
         octomap("OctoMap, discretised", 1 / 15, discretize=True),
         Peer(binding, lambda: peers.octomap_binding(len(points), edge_m), modules=("octomap",)),
         Peer("touched memory once", lambda: touched_once(scene, prepared), 2.0, gated),
+        Peer("in JAX alone", lambda: ours.fuse_frame(scene, size, add_plainly).run),
     ]
     voxels = Amount(int(np.prod(grid_of(size).shape)), "voxels")
     return case_of(prepared, voxels, Amount(scene.pixels, "points"), beside)

@@ -25,7 +25,9 @@ from scene import DEPTH_RANGE_M, DISPARITIES, Scene, grid_of, moved_poses
 
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.fusion.carve import carve
+from jaxmap.fusion.frame import Sighting
 from jaxmap.fusion.integrate import integrate
+from jaxmap.fusion.kernel import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import top_down
@@ -169,22 +171,30 @@ def integrate_frame(scene: Scene, grid: GridSpec) -> Prepared:
     return prepare_update(add, empty.log_odds, rest, points_of(scene), jnp.ones(scene.pixels))
 
 
-def fuse_frame(scene: Scene, size: str) -> Prepared:
-    """Carving and integration of one frame, as the step does them; the result is the map's tensor."""
+def fuse_frame(scene: Scene, size: str, add: Callable[..., Any] = add_sighting) -> Prepared:
+    """Carving and integration of one frame, as the step does them; the result is the map's tensor.
+
+    Args:
+        scene: the frame.
+        size: of the voxels.
+        add: `kernel.add_sighting`, or its twin `frame.add_plainly`.
+    """
     params, grid = make_fusion_params(ROVER_CLASSES), grid_of(size)
     empty = make_voxel_map(grid, ROVER_CLASSES)
     shape = window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1))
+    points = points_of(scene)
 
-    def fuse(log_odds: jax.Array, rest: VoxelMap, points: Points, pose: jaxlie.SE3) -> jax.Array:
+    def fuse(log_odds: jax.Array, rest: VoxelMap, points: Points, columns: list[jax.Array], pose: jaxlie.SE3) -> Any:
         cloud, voxel_map = points.cloud, replace(rest, log_odds=log_odds)
-        window = view_window(grid, scene.camera, pose, DEPTH_RANGE_M[1], shape)
-        free = carve(scene.camera, pose, cloud.depth_m, cloud.valid, window, params, DEPTH_RANGE_M)
-        weights = point_weights(grid, cloud, RULE)
-        return integrate(voxel_map, cloud.points_world, points.labels, weights, params, RULE, window=window, free=free)[
-            0
-        ].log_odds
+        window = view_window(rest.grid, scene.camera, pose, DEPTH_RANGE_M[1], shape)
+        weights, points_world = point_weights(rest.grid, cloud, RULE), jnp.stack(columns, axis=-1)
+        sighting = Sighting(scene.camera, pose, points_world, points.labels, weights, None, cloud.depth_m, cloud.valid)
+        return add(voxel_map, sighting, window, params, RULE, DEPTH_RANGE_M)[0].log_odds
 
-    return prepare_update(fuse, empty.log_odds, replace(empty, log_odds=None), points_of(scene), scene.pose)
+    # By columns, as the step has them.
+    columns = [jnp.array(points.cloud.points_world[:, axis]) for axis in range(3)]
+    points = points._replace(cloud=points.cloud._replace(points_world=None))  # pyright: ignore[reportArgumentType]
+    return prepare_update(fuse, empty.log_odds, replace(empty, log_odds=None), points, columns, scene.pose)
 
 
 @cache
