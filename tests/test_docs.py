@@ -57,7 +57,8 @@ def materials(tmp_path_factory) -> Path:
     architecture = replace(jaxmap.torch_architecture("resnet18", ("sand", "rock")), head_channels=4)
     jaxmap.save_model(folder / "model.safetensors", architecture, seeded_weights(architecture))
     Image.fromarray(seeded_image(20, 30)).save(folder / "left.png")
-    (folder / "fusion.yaml").write_text("depth: {max_m: 8}\n")
+    for name in ("fusion", "stereo"):
+        (folder / f"{name}.yaml").write_text("depth: {max_m: 8}\n")
     return folder
 
 

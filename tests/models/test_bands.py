@@ -102,6 +102,7 @@ def test_large_hidden_images_are_made_by_bands_where_norms_are_folded(monkeypatc
         return images
 
     monkeypatch.setattr(backbones, "apply_by_bands", counted)
+    monkeypatch.setenv("JAXMAP_NATIVE", "0")
 
     images = jax.ShapeDtypeStruct((1, 384, 512, 3), jnp.float32)
     nnx.eval_shape(lambda images: InvertedResidualNet(record)(images), images)

@@ -15,6 +15,7 @@ from planned_runs import planned
 from jaxmap.errors import JaxmapError
 from jaxmap.mapping.sequence import prepare_frames
 from jaxmap.mapping.step import compile_step
+from jaxmap.native.build import FUSE_TARGET, has_kernel
 from jaxmap.profiling.program import OTHER, STAGES, Operation, read_program
 from jaxmap.profiling.step_profile import (
     TRACED_FRAMES,
@@ -40,7 +41,8 @@ def test_a_trace_shows_the_stages_of_the_host(scene_folder, tmp_path):
     assert event_names(tmp_path) >= {"read", "rectify", "match", "labels"}
 
 
-FUSION = ("project", "transform", "carve", "count_points", "frame_evidence", "add_evidence")
+POINTS = ("project", "transform")
+FUSION = (*POINTS, "carve", "count_points", "frame_evidence", "add_evidence")
 
 
 @pytest.mark.parametrize(
@@ -55,7 +57,18 @@ FUSION = ("project", "transform", "carve", "count_points", "frame_evidence", "ad
         pytest.param({"labeller": "deeplab"}, (*FUSION, "network", "pixel_labels"), marks=pytest.mark.slow),
     ],
 )
-def test_every_stage_is_named_in_the_compiled_step(scene_folder, settings, stages):
+def test_every_stage_is_named_in_the_compiled_step(scene_folder, settings, stages, monkeypatch):
+    monkeypatch.setenv("JAXMAP_NATIVE", "0")
+    check_stages(scene_folder, settings, stages)
+
+
+@pytest.mark.skipif(not has_kernel(FUSE_TARGET), reason="no C++ compiler makes the kernel")
+@pytest.mark.slow
+def test_the_kernel_is_one_stage(scene_folder):
+    check_stages(scene_folder, {}, (*POINTS, "fuse", "mlesac", "plane_labels"))
+
+
+def check_stages(scene_folder, settings, stages) -> None:
     plan = planned(scene_folder, **settings)
     _, cost = compile_step(plan.mapper, plan.mapper.init(), plan.frame_form, plan.params, plan.key)
     named = {operation.stage for operation in read_program(cost.program()).values()}
