@@ -15,7 +15,7 @@ from typing import NamedTuple
 from jaxmap.native.build import TARGET
 
 STAGES = (
-    *("project", "transform", "relief", "mlesac", "plane_labels", "network", "pixel_labels"),
+    *("rectify", "match", "project", "transform", "relief", "mlesac", "plane_labels", "network", "pixel_labels"),
     *("view_window", "fuse", "carve", "count_points", "frame_evidence", "add_evidence", "fuse_members"),
 )
 """The named scopes of the step, in its order."""

@@ -48,10 +48,10 @@ FUSION = (*POINTS, "carve", "count_points", "frame_evidence", "add_evidence")
 @pytest.mark.parametrize(
     ("settings", "stages"),
     [
-        ({}, (*FUSION, "mlesac", "plane_labels")),
+        ({}, (*FUSION, "mlesac")),
         pytest.param(
             {"ensemble": {"members": 2}},
-            (*FUSION, "mlesac", "plane_labels", "fuse_members"),
+            (*FUSION, "mlesac", "fuse_members"),
             marks=pytest.mark.slow,
         ),
         pytest.param({"labeller": "deeplab"}, (*FUSION, "network", "pixel_labels"), marks=pytest.mark.slow),
@@ -99,7 +99,8 @@ def test_a_trace_of_steps_is_summed_by_stages(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_profiled_run_reports_where_its_steps_went(cli, scene_folder, tmp_path):
+def test_a_profiled_run_reports_where_its_steps_went(cli, scene_folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXMAP_NATIVE", "0")
     run = tmp_path / "run"
     outcome = cli(*map_words(scene_folder, run, "--profile"))
     assert outcome.status == 0
