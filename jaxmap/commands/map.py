@@ -104,10 +104,16 @@ def main(words: Sequence[str]) -> int:
         metrics = _map_shared(arguments, folder, console)
         return _tell(arguments, metrics, console)
     with console.counted("odometry", "frames") as on_frame:
-        keep = arguments.keep_observations
-        # A viewer shows the disparity of every frame.
-        how = {"keep": keep, "match_in_step": not watched, "in_tiles": True}
-        plan = plan_run(arguments.sequence, config, console.notify, on_frame, **how)
+        plan = plan_run(
+            arguments.sequence,
+            config,
+            console.notify,
+            on_frame,
+            keep=arguments.keep_observations,
+            # A viewer shows the disparity of every frame.
+            match_in_step=not watched,
+            in_tiles=True,
+        )
     devices = choose_devices(arguments.devices, plan.members)
     folder.check_apart(plan.source, plan.images, (config.poses, config.calibration, config.model))
     resume, overwrite = arguments.resume, arguments.overwrite

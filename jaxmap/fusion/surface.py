@@ -186,7 +186,7 @@ def surface_of(columns: ColumnHeights, grid: GridSpec, most_sigma_m: float = 0.0
         return Surface(floor_m + (highest + 0.5) * size_m, sigma, seen)
     height_m, variance, known = jnp.zeros(seen.shape), jnp.zeros(seen.shape), jnp.zeros(seen.shape, bool)
     for width in range(reach + 1):
-        mean_m, wider, count = _heights_around(statistics, width)
+        mean_m, wider, count = _heights_around(jnp.asarray(statistics), width)
         inside = (mean_m > floor_m + (lowest - 1) * size_m) & (mean_m < floor_m + (highest + 2) * size_m)
         more = ~known & seen & inside & (count >= _FEWEST_POINTS) & (wider < most_sigma_m**2)
         height_m, variance, known = jnp.where(more, mean_m, height_m), jnp.where(more, wider, variance), known | more
@@ -201,7 +201,8 @@ def _heights_around(statistics: Float[Array, "4 X Y"], reach: int) -> tuple[Arra
         padded = jnp.pad(statistics, [(0, 0), (reach, reach), (reach, reach)])
 
         def add(total: Array, offset: Array) -> tuple[Array, None]:
-            return combine(total, jax.lax.dynamic_slice(padded, (0, *offset), statistics.shape)), None
+            there = jax.lax.dynamic_slice(padded, (0, *offset), statistics.shape)
+            return jnp.asarray(combine(total, there)), None
 
         total, _ = jax.lax.scan(add, statistics, jnp.array(offsets))
     count, weight, mean_m, square = total
