@@ -30,7 +30,7 @@ class RoverOptions:
     """Greatest root mean square of the ground's distances from a plane under the rover."""
     free: Annotated[float, Interval(ge=0, lt=1)] = 0.3
     """Hazards below this part of their greatest cost nothing."""
-    rock_cost: Annotated[float, NotNegative] = 10.0
+    rock_cost: Annotated[float, NotNegative] = 100.0
     """What driving a metre costs that is certain to lead over rock: it counts by its probability."""
     rock_m: Radius = 0.1
     """Radius over which the probability of rock is averaged, that of the least rock worth a detour: one column alone is

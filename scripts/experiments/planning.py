@@ -8,7 +8,7 @@ are free in truth, in view, at least 3 m apart, and between which true rock bars
 are such pairs. Prints, for each way to see rocks, how many paths were found and how many of them collide: come closer
 to a true rock of more than 0.3 m than the rover's radius; and their length over that of the same planner where it
 knows true heights and all rocks of more than 0.3 m. Rows plane, network and relief plan by what labels say alone;
-hazards by heights alone; ours by both. The scores of a world are kept in its folder, as planning.json.
+hazards by heights alone; ours by both. The scores of a world are kept in its folder.
 """
 
 from __future__ import annotations
@@ -62,8 +62,7 @@ def worlds(folder: Path | None, seeds: list[int], known: list[Path]) -> Iterator
     for seed in seeds:
         assert folder is not None, "--seeds needs --worlds"
         world = folder / f"{seed}"
-        if not (world / "planning.json").exists():
-            jaxmap("simulate", "--out", world, "--seed", seed, *RENDERING)
+        jaxmap("simulate", "--out", world, "--seed", seed, *RENDERING)
         yield world
 
 
@@ -193,12 +192,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[])
     parser.add_argument("--known", type=Path, nargs="*", default=[])
     parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--rock-cost", type=float, default=RoverOptions().rock_cost, help="of the rover")
     parser.add_argument("--json", type=Path)
     given, sums = parse(parser), dict[str, Tally]()
+    rover = replace(RoverOptions(), rock_cost=given.rock_cost)
     for number, folder in enumerate(worlds(given.worlds, given.seeds, given.known)):
-        done = folder / "planning.json"
+        done = folder / f"planning_{rover.rock_cost:g}.json"
         if not done.exists():
-            done.write_text(json.dumps(tallies_of(folder, given.pairs, number, RoverOptions())))
+            done.write_text(json.dumps(tallies_of(folder, given.pairs, number, rover)))
         tallies = {name: Tally(*tally[:3], tuple(tally[3])) for name, tally in json.loads(done.read_text()).items()}
         sums = {name: sums.get(name, Tally()) + tally for name, tally in tallies.items()}
         told = ", ".join(f"{name} {tally.refused}/{tally.collided}" for name, tally in tallies.items())
