@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import truth_files
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from jaxmap.datasets.label_raster import LabelRaster
@@ -146,6 +148,14 @@ def loss_of(params: FusionParams, log_odds: jax.Array, truth: MapTruth, rule: Fu
 slopes = jax.jit(jax.grad(loss_of, argnums=(0, 1)), static_argnums=3)
 
 
+def slope_of(loss_at: Callable[[float], Any]) -> float:
+    """The slope at 0 of what is smooth there; other examples, with a tie within a step, are left out."""
+    behind, here, ahead = (float(loss_at(step)) for step in (-STEP, 0.0, STEP))
+    slope = (ahead - behind) / (2 * STEP)
+    assume(abs(ahead - 2 * here + behind) / (2 * STEP) <= 3e-4 * abs(slope) + 10 * STEP)
+    return slope
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rule", SOME_RULES)
 @given(seed=st.integers(0, 2**16))
@@ -159,16 +169,16 @@ def test_gradients_equal_finite_differences(rule, seed):
         rng = np.random.default_rng(seed)
         touched = np.asarray(log_odds != 0)
         direction = rng.normal(size=log_odds.shape) * touched
-        ahead, behind = (loss_of(params, log_odds + step * direction, truth, rule) for step in (STEP, -STEP))
-        np.testing.assert_allclose((of_map * direction).sum(), (ahead - behind) / (2 * STEP), rtol=1e-4, atol=1e-7)
+        slope = slope_of(lambda step: loss_of(params, log_odds + step * direction, truth, rule))
+        np.testing.assert_allclose((of_map * direction).sum(), slope, rtol=1e-4, atol=1e-7)
         for field in fields(FusionParams):
             leaf, ours = getattr(params, field.name), getattr(of_params, field.name)
             direction = rng.normal(size=leaf.shape)
-            ahead, behind = (
-                loss_of(replace(params, **{field.name: leaf + step * direction}), log_odds, truth, rule)
-                for step in (STEP, -STEP)
-            )
-            slope = (ahead - behind) / (2 * STEP)
+
+            def loss_at(step, field=field, leaf=leaf, direction=direction):
+                return loss_of(replace(params, **{field.name: leaf + step * direction}), log_odds, truth, rule)
+
+            slope = slope_of(loss_at)
             np.testing.assert_allclose((ours * direction).sum(), slope, rtol=1e-4, atol=1e-7, err_msg=field.name)
 
 
