@@ -11,6 +11,7 @@ from planned_runs import config_of, log_odds, planned
 from scenes import scene_frame
 
 from jaxmap.mapping.observations import open_observations
+from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping_plan import plan_run
 from jaxmap.stereo.jax_matcher import JaxMatcher
 
@@ -60,7 +61,7 @@ def test_a_map_is_the_same_however_its_frames_were_matched(scene_folder, cli, tm
     for name in ("kept", "anew"):
         np.testing.assert_array_equal(log_odds(tmp_path / name), log_odds(tmp_path / "step"))
     observations, front_end = (
-        open_observations(observed(tmp_path / "seen")),
+        open_observations(RunFolder(tmp_path / "seen").observations),
         planned(scene_folder, **SETTINGS).front_end,
     )
     for index in range(2):
