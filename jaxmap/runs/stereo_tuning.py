@@ -28,10 +28,12 @@ from jaxmap.runs.labelling import Notify
 from jaxmap.runs.mapping_plan import Plan, plan_run
 from jaxmap.runs.tuning import (
     Source,
+    check_frozen,
     decided,
     mapping_tree,
     read_traverse,
     scores_of_parts,
+    target_of,
     usable_frames,
     write_result,
 )
@@ -83,11 +85,8 @@ class StereoTuningRun:
                 config = decided(config, self._plans[0])
         self._config = config
         self._start = _matcher(self._plans[0]).params
-        self._target = _target(self._plans[0], truth.target)
-        names = free_match(self._start)
-        if unknown := [name for name in options.frozen if name not in names]:
-            fix = f"name some of {' '.join(names)}"
-            raise UsageError(f"no parameter {', '.join(unknown)}", where="--frozen", fix=fix)
+        self._target = target_of(self._plans[0], truth.target)
+        check_frozen(options.frozen, tuple(free_match(self._start)))
         # Read twice: before, and matched anew in the end.
         self.frames = sum(len(plan.sequence.frames) for plan in self._plans)
         self._traverses: list[Traverse] = []
@@ -213,17 +212,6 @@ def _refuse(config: MapConfig, options: TuneOptions) -> None:
 def _matcher(plan: Plan) -> JaxMatcher:
     assert isinstance(plan.front_end.matcher, JaxMatcher)
     return plan.front_end.matcher
-
-
-def _target(plan: Plan, name: str) -> int:
-    classes = plan.labeller.classes
-    if name not in classes:
-        raise UsageError(
-            f"the map has no class {name!r}: its classes are {' '.join(classes) or 'none'}",
-            where="--class",
-            fix="name one of them, or choose another --labeller",
-        )
-    return classes.index(name)
 
 
 def _small_traverse(plan: Plan, scored: Traverse, frames: list[Frame], times: int) -> StereoTraverse:

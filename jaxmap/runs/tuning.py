@@ -137,21 +137,39 @@ def plan_tuning(
         if len(mappings) == 1:
             # What a sequence leaves open is decided once: the numbers hold for these voxels and this range.
             config = decided(config, mappings[0])
-    classes = mappings[0].labeller.classes
-    if target not in classes:
-        raise UsageError(
-            f"the map has no class {target!r}: its classes are {' '.join(classes) or 'none'}",
-            where="--class",
-            fix="name one of them, or choose another --labeller",
-        )
+    scored = target_of(mappings[0], target)
     start = TunedParams(mappings[0].params.fusion, tunable_numbers(mappings[0].labeller, mappings[0].rule))
-    names = plain(start)
-    if unknown := [name for name in options.frozen if name not in names]:
-        raise UsageError(f"no parameter {', '.join(unknown)}", where="--frozen", fix=f"name some of {' '.join(names)}")
+    check_frozen(options.frozen, tuple(plain(start)))
     before = start
     if sharp and start.labeller:
         before = start._replace(labeller=start.labeller | {"softness_m": jnp.zeros(())})
-    return TuningPlan(config, tuple(mappings), classes.index(target), before, start)
+    return TuningPlan(config, tuple(mappings), scored, before, start)
+
+
+def target_of(plan: Plan, name: str) -> int:
+    """The index of the class that is scored.
+
+    Raises:
+        UsageError: the map has none of that name.
+    """
+    classes = plan.labeller.classes
+    if name not in classes:
+        raise UsageError(
+            f"the map has no class {name!r}: its classes are {' '.join(classes) or 'none'}",
+            where="--class",
+            fix="name one of them, or choose another --labeller",
+        )
+    return classes.index(name)
+
+
+def check_frozen(frozen: Sequence[str], names: Sequence[str]) -> None:
+    """Refuses parameters to keep as they are that are none of those tuned.
+
+    Raises:
+        UsageError: there are some.
+    """
+    if unknown := [name for name in frozen if name not in names]:
+        raise UsageError(f"no parameter {', '.join(unknown)}", where="--frozen", fix=f"name some of {' '.join(names)}")
 
 
 def decided(config: MapConfig, plan: Plan) -> MapConfig:
