@@ -20,8 +20,8 @@ def match(
 ) -> Float[Array, "H W"]:
     """Disparity of the left image in px, float32; NaN where it is unknown.
 
-    But in soft mode it is a multiple of 1/16, as OpenCV's are and as observations are kept: a map comes out the same
-    whichever way its frames went.
+    Except in soft mode it is a multiple of 1/16, as OpenCV's is and as observations keep it, so that a map is the same
+    whether the step matches or its frames were matched before.
 
     Args:
         design: what is fixed before compiling.

@@ -112,11 +112,10 @@ def drop_edges(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Float[
     """Without pixels near a step of disparity: there, rocks are smeared over the ground behind."""
     if not design.edge_step_px:
         return disparity_px
-    window, unknown = (design.edge_window_px,) * 2, jnp.isnan(disparity_px)
+    unknown = jnp.isnan(disparity_px)
     near = jnp.where(unknown, jnp.inf, disparity_px)
     far = jnp.where(unknown, -jnp.inf, disparity_px)
-    for axis in (0, 1):
-        window = tuple(design.edge_window_px if axis == one else 1 for one in (0, 1))
+    for window in ((design.edge_window_px, 1), (1, design.edge_window_px)):
         near = jax.lax.reduce_window(near, jnp.inf, jax.lax.min, window, (1, 1), "same")
         far = jax.lax.reduce_window(far, -jnp.inf, jax.lax.max, window, (1, 1), "same")
     return jnp.where(far - near > design.edge_step_px, jnp.nan, disparity_px)
