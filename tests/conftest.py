@@ -75,16 +75,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="run the tests marked slow, too")
 
 
-MOST_RESIDENT_MB = 900
-"""Compiled programs are dropped after a file that leaves more; a file adds up to 1 GB, and a worker stays below 2."""
+MOST_RESIDENT_MB, MOST_GROWN_MB = 900, 300
+"""Compiled programs are dropped after a file that leaves more than the first, and the second more than was left when
+they were dropped last: libraries, which stay, may take the first by themselves. A file adds up to 1 GB."""
 
+LEFT_MB = pytest.StashKey[float]()
 PEAK = pytest.StashKey[tuple[float, str]]()
 PEAKS = pytest.StashKey[dict[str, tuple[float, str]]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile(("ci-" if os.environ.get("CI") else "") + ("all" if config.getoption("--all") else "quick"))
-    config.stash[PEAK] = (0.0, "")
+    config.stash[LEFT_MB], config.stash[PEAK] = 0.0, (0.0, "")
     config.stash[PEAKS] = {}
     if not is_worker(config):
         size = sum(path.stat().st_size for path in CACHE.rglob("*") if path.is_file())
@@ -103,12 +105,14 @@ def _memory(request: pytest.FixtureRequest) -> Iterator[None]:
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
     if peak_mb > request.config.stash[PEAK][0]:
         request.config.stash[PEAK] = (peak_mb, request.node.nodeid)
-    if (jax := sys.modules.get("jax")) is not None and resident_mb() > MOST_RESIDENT_MB:
+    enough_mb = max(MOST_RESIDENT_MB, request.config.stash[LEFT_MB] + MOST_GROWN_MB)
+    if (jax := sys.modules.get("jax")) is not None and resident_mb() > enough_mb:
         jax.clear_caches()
         gc.collect()
         # The C library keeps what is freed in pieces, unless it is asked.
         with suppress(AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
+        request.config.stash[LEFT_MB] = resident_mb()
 
 
 def resident_mb() -> float:

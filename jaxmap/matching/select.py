@@ -13,6 +13,7 @@ from jaxmap.matching.blobs import drop_blobs
 from jaxmap.matching.design import MatchDesign, MatchParams
 
 _SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
+"""Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
 
 class Winners(NamedTuple):
@@ -104,8 +105,13 @@ def drop_speckles(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Flo
     """Without blobs of few pixels: they are mostly false, and what stands on the ground is no blob."""
     most = design.speckle_window_px
     if most is None:
-        most = max(round(disparity_px.size * _SPECKLE_SHARE), _LEAST_SPECKLE_PX)
+        most = usual_speckle_px(disparity_px.size)
     return drop_blobs(disparity_px, design.speckle_range_px, most) if most else disparity_px
+
+
+def usual_speckle_px(image_px: int) -> int:
+    """The most pixels of a blob that is dropped, in images of so many pixels."""
+    return max(round(image_px * _SPECKLE_SHARE), _LEAST_SPECKLE_PX)
 
 
 def drop_edges(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Float[Array, "H W"]:

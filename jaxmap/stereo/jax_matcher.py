@@ -9,11 +9,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from jaxmap.errors import FrameError
 from jaxmap.matching.design import Cost, MatchDesign, MatchParams, make_match_params
 from jaxmap.matching.match import match
 from jaxmap.matching.mccnn import load_cost_network
-from jaxmap.stereo.match import Matcher, StereoOptions
+from jaxmap.stereo.match import Matcher, StereoOptions, check_same_size
 from jaxmap.types import to_device
 
 
@@ -61,9 +60,7 @@ class JaxMatcher:
         Raises:
             FrameError: the two images differ in size.
         """
-        if left.shape[:2] != right.shape[:2]:
-            sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
-            raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
+        check_same_size(left, right)
         # One pair at a time takes all cores, and a volume of costs for each of several threads much memory.
         with self._lock:
             return np.array(_matched(self.design, to_device(left), to_device(right), self.params))
@@ -98,7 +95,7 @@ def match_design(options: StereoOptions, width_px: int) -> MatchDesign:
     return MatchDesign(
         cost=_cost(options),
         min_disparity_px=options.min_disparity_px,
-        num_disparities=options.num_disparities or -(-width_px // (8 * 16)) * 16,
+        num_disparities=options.disparities(width_px),
         paths=options.paths,
         soft=options.soft,
         kernels=options.kernels,

@@ -18,8 +18,6 @@ _MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
 """OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
 _OF_OPENCV = ("mode", "p1", "p2", "pad_left")
 _OF_STEP = ("cost", "paths", "step_penalty", "jump_penalty", "soft", "temperature", "kernels")
-_SPECKLE_SHARE, _LEAST_SPECKLE_PX = 1 / 800, 100
-"""Of the image: islands of false matches in the sky are seldom larger, and what stands on the ground is no island."""
 
 
 @options("stereo")
@@ -120,6 +118,10 @@ class StereoOptions:
                     f"leave it at {one.default}, or choose another --stereo.matcher",
                 )
 
+    def disparities(self, width_px: int) -> int:
+        """How many disparities are searched in images of this width."""
+        return self.num_disparities or -(-width_px // (8 * 16)) * 16
+
     def penalties(self) -> tuple[int, int]:
         """The penalties p1 and p2 of disparity steps."""
         area = self.block_size**2
@@ -136,7 +138,7 @@ class Matcher:
             UsageError: as many disparities as columns, or more.
         """
         self.options = options
-        self.num_disparities = options.num_disparities or -(-width_px // (8 * 16)) * 16
+        self.num_disparities = options.disparities(width_px)
         if not options.pad_left and self.num_disparities + options.min_disparity_px >= width_px:
             raise _bad(f"{self.num_disparities} disparities in images {width_px} px wide", "take fewer")
         self._local = threading.local()
@@ -155,9 +157,7 @@ class Matcher:
         Raises:
             FrameError: the two images differ in size.
         """
-        if left.shape[:2] != right.shape[:2]:
-            sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
-            raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
+        check_same_size(left, right)
         left, right = as_grey(left), as_grey(right)
         pad = max(self.num_disparities + self.options.min_disparity_px, 0) if self.options.pad_left else 0
         padded = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
@@ -191,15 +191,17 @@ class Matcher:
 
     def engine(self, image_px: int) -> Any:
         """OpenCV's matcher of grey images of so many pixels; each thread has its own, which reuses its buffers."""
-        # Imported here, so that the command line can read the options without OpenCV.
+        # Imported here, so that the command line can read the options without OpenCV and JAX.
         import cv2
+
+        from jaxmap.matching.select import usual_speckle_px
 
         if not hasattr(self._local, "engine"):
             options, unchecked = self.options, self.options.left_right_max_diff_px < 0
             p1, p2 = options.penalties()
             speckle_px = options.speckle_window
             if speckle_px is None:
-                speckle_px = max(round(image_px * _SPECKLE_SHARE), _LEAST_SPECKLE_PX)
+                speckle_px = usual_speckle_px(image_px)
             mode = "SGBM_3WAY" if options.mode == "3way" else options.mode.upper()
             self._local.engine = cv2.StereoSGBM.create(
                 minDisparity=options.min_disparity_px,
@@ -216,6 +218,17 @@ class Matcher:
                 mode=getattr(cv2, f"STEREO_SGBM_MODE_{mode}"),
             )
         return self._local.engine
+
+
+def check_same_size(left: np.ndarray, right: np.ndarray) -> None:
+    """Refuses a pair that cannot be matched.
+
+    Raises:
+        FrameError: the two images differ in size.
+    """
+    if left.shape[:2] != right.shape[:2]:
+        sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
+        raise FrameError(f"the left image is {sizes[0]} and the right one {sizes[1]}")
 
 
 def as_grey(image: np.ndarray) -> np.ndarray:

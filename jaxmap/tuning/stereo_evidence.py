@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxmap.fusion.carve import carve
+from jaxmap.fusion.integrate import add_evidence
 from jaxmap.fusion.sensor_model import frame_evidence, point_weights
 from jaxmap.fusion.splat import splat_trilinear
 from jaxmap.geometry.cloud import project
@@ -154,13 +155,8 @@ def make_stereo_gradient(traverse: StereoTraverse, target: int, options: MapLoss
         params = replace(traverse.params, match=match)
         return soft_evidence(design, empty.grid, frame, params, jax.random.fold_in(key, number), times)
 
-    def place(window: GridSpec) -> tuple[Array, ...]:
-        return (jnp.zeros((), jnp.int32), *(window.first - empty.grid.first))
-
     def add(log_odds: Array, match: MatchParams, frame: Frame, number: Int[Array, ""] | int) -> Array:
-        said, window = evidence(match, frame, number)
-        here = jax.lax.dynamic_slice(log_odds, place(window), said.shape)
-        return jax.lax.dynamic_update_slice(log_odds, here + said, place(window))
+        return add_evidence(replace(empty, log_odds=log_odds), *evidence(match, frame, number)).log_odds
 
     def score(log_odds: Array) -> tuple[Losses, Array]:
         return jax.value_and_grad(lambda log_odds: stereo_losses(log_odds, traverse, target, options), has_aux=True)(
@@ -171,7 +167,8 @@ def make_stereo_gradient(traverse: StereoTraverse, target: int, options: MapLoss
         gradient: MatchParams, cotangent: Array, match: MatchParams, frame: Frame, number: Int[Array, ""] | int
     ) -> MatchParams:
         said, back, window = jax.vjp(lambda match: evidence(match, frame, number), match, has_aux=True)
-        here = jax.lax.dynamic_slice(cotangent, place(window), said.shape)
+        corner = (jnp.zeros((), jnp.int32), *(window.first - empty.grid.first))
+        here = jax.lax.dynamic_slice(cotangent, corner, said.shape)
         return jax.tree.map(jnp.add, gradient, back(here)[0])
 
     add_one, pull_one = jax.jit(add, donate_argnums=0), jax.jit(pull, donate_argnums=0)
