@@ -9,8 +9,10 @@ from jaxtyping import Array, Float, Num
 from jaxmap.matching.aggregate import aggregate_planes
 from jaxmap.matching.costs import cost_planes, cost_volume
 from jaxmap.matching.design import MOST_P1, MOST_P2, MatchDesign, MatchParams
+from jaxmap.matching.kernel import winners_cpu
 from jaxmap.matching.select import Winners, decide, winners
 from jaxmap.matching.soft import soft_match
+from jaxmap.native.build import SGM_TARGET, has_kernel
 
 _SUBPIXELS = 16
 
@@ -40,7 +42,7 @@ def match(
 def find_winners(
     design: MatchDesign, left: Num[Array, "H W"], right: Num[Array, "H W"], params: MatchParams
 ) -> Winners:
-    """The cheapest disparities of two grey images; on a CUDA device by kernels made for it, bit for bit the same."""
+    """The cheapest disparities of two grey images; by kernels made for the device where there are, bit for bit the same."""
     p1, p2 = penalties(design, params)
 
     def by_rows(left: Array, right: Array) -> Winners:
@@ -52,10 +54,16 @@ def find_winners(
         check_cards(jax.devices())
         return winners_gpu(cost_volume(design, left, right, params, at_once=True), p1, p2, design.paths)
 
-    # Where there is nothing but a CPU, the other way is not even traced: to import Pallas takes a quarter of a second.
-    if jax.default_backend() == "cpu" or not design.kernels:
+    def on_cpu(left: Array, right: Array) -> Winners:
+        return winners_cpu(design, left, right, params, p1, p2)
+
+    if not design.kernels:
         return by_rows(left, right)
-    return jax.lax.platform_dependent(left, right, cuda=by_paths, default=by_rows)
+    # Where there is nothing but a CPU, the GPU's way is not even traced: to import Pallas takes a quarter of a second.
+    by_device = {"cpu": on_cpu} if has_kernel(SGM_TARGET) else {}
+    if jax.default_backend() != "cpu":
+        by_device["cuda"] = by_paths
+    return jax.lax.platform_dependent(left, right, default=by_rows, **by_device)
 
 
 def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:
