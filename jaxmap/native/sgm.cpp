@@ -15,6 +15,8 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <type_traits>
+#include <utility>
 #include <vector>
 
 #if defined(__SSE4_1__)
@@ -71,6 +73,29 @@ inline int least_of(Bytes16 bytes) {
   return least_of(lesser(words & 0xff, words >> 8));
 }
 
+// The upper half of the products of 16-bit numbers.
+template <typename Words>
+inline Words high_product(Words words, uint16_t factor) {
+#if defined(__AVX512BW__)
+  if constexpr (sizeof(Words) == 64) return (Words)_mm512_mulhi_epu16((__m512i)words, _mm512_set1_epi16(factor));
+#endif
+#if defined(__AVX2__)
+  if constexpr (sizeof(Words) == 32) return (Words)_mm256_mulhi_epu16((__m256i)words, _mm256_set1_epi16(factor));
+#endif
+  for (size_t i = 0; i < sizeof(Words) / 2; ++i) words[i] = uint16_t((uint32_t(words[i]) * factor) >> 16);
+  return words;
+}
+
+// The lanes of a vector moved up by one, with the last of the one before it; and down, with the first of the next.
+template <typename Bytes, int... kLane>
+inline Bytes moved_up(Bytes before, Bytes here, std::integer_sequence<int, kLane...>) {
+  return __builtin_shufflevector(before, here, (kLane + int(sizeof(Bytes)) - 1)...);
+}
+template <typename Bytes, int... kLane>
+inline Bytes moved_down(Bytes here, Bytes next, std::integer_sequence<int, kLane...>) {
+  return __builtin_shufflevector(here, next, (kLane + 1)...);
+}
+
 // Of a longer vector: halves are compared until 16 bytes are left.
 template <typename Vector>
 inline int least_of(Vector vector) {
@@ -125,131 +150,151 @@ class Room {
 // ---- Costs of the census ----
 
 // Row by row, in the order of a walk; each is the mean over a block, whose edges are repeated.
+template <int kBytes, int kVectors>
 class CensusCosts {
  public:
-  CensusCosts(const Pair& pair, int64_t padded) : pair_(pair), padded_(padded) {
-    const int64_t row = pair.width * padded;
-    reversed_.resize(pair.words * (pair.width + padded));
-    if (pair.block == 1) return;
+  using Bytes = typename VectorOf<uint8_t, kBytes>::type;
+  using Words = typename VectorOf<uint16_t, kBytes>::type;
+
+  CensusCosts(const Pair& pair, int vectors)
+      : pair_(pair), vectors_(vectors), padded_(vectors * kBytes), reach_(pair.block / 2) {
+    reversed_.resize(pair.words * (pair.width + padded_));
+    if (pair.block == 1 || pair.costs != nullptr) return;
+    const int64_t row = pair.width * padded_;
     raw_.resize((pair.block + 1) * row);
-    kept_.assign(pair.block + 1, -1);
+    held_.assign(pair.block + 1, -1);
     columns_.assign(row, 0);
-    const uint32_t size = pair.block * pair.block;
+    const int size = pair.block * pair.block;
     while (size >> (shift_ + 1)) ++shift_;
-    factor_ = (uint64_t(1) << (16 + shift_)) / size + 1;
+    factor_ = uint16_t((1 << (16 + shift_)) / size + 1);
   }
 
-  // The row after `y` in the walk must be `y + step`.
-  void row(int64_t y, int64_t step, uint8_t* costs) {
-    if (pair_.block == 1) {
-      compare(y, costs);
+  // Before the pixels of a row, which come from the left; the row after `y` must be `y + step`.
+  void start(int64_t y, int64_t step) {
+    if (pair_.block == 1) return describe(y);
+    const int64_t last = pair_.height - 1;
+    if (!begun_) {
+      for (int64_t k = -reach_; k <= reach_; ++k) {
+        const int64_t row = std::clamp<int64_t>(y + k, 0, last);
+        start_column_sums(row);
+        for (int64_t x = 0; x < pair_.width; ++x) add_to_column(x);
+      }
+      come_ = gone_ = nullptr;
     } else {
-      sum_columns(y, step);
-      average(costs);
+      start_column_sums(std::clamp<int64_t>(y + step * reach_, 0, last));
+      gone_ = row_of(std::clamp<int64_t>(y - step * (reach_ + 1), 0, last));
     }
-    mark_outside(costs);
+    begun_ = true;
+    for (int64_t x = 0; x <= std::min(reach_, pair_.width - 1); ++x) add_to_column(x);
+    for (int k = 0; k < vectors(); ++k) even_[k] = odd_[k] = Words{} + uint16_t(pair_.block * pair_.block / 2);
+    for (int64_t x = -reach_; x <= reach_; ++x) {
+      const uint16_t* column = column_of(x);
+      for (int k = 0; k < vectors(); ++k, column += kBytes)
+        even_[k] += load<Words>(column), odd_[k] += load<Words>(column + kBytes / 2);
+    }
+  }
+
+  // The costs of the next pixel.
+  void pixel(int64_t x, uint8_t* costs) {
+    if (pair_.block == 1) {
+      compare(x, costs);
+    } else {
+      for (int k = 0; k < vectors(); ++k)
+        store(costs + k * kBytes, (Bytes)(mean(even_[k]) | mean(odd_[k]) << 8));
+      if (x + reach_ + 1 < pair_.width) add_to_column(x + reach_ + 1);
+      const uint16_t *come = column_of(x + reach_ + 1), *gone = column_of(x - reach_);
+      for (int k = 0; k < vectors(); ++k, come += kBytes, gone += kBytes) {
+        even_[k] += load<Words>(come) - load<Words>(gone);
+        odd_[k] += load<Words>(come + kBytes / 2) - load<Words>(gone + kBytes / 2);
+      }
+    }
+    // Matches outside the right image have the largest cost.
+    const int64_t from = std::clamp<int64_t>(x - pair_.first - (pair_.width - 1), 0, padded_);
+    const int64_t to = std::clamp<int64_t>(x - pair_.first + 1, from, padded_);
+    if (from > 0) std::memset(costs, pair_.outside, from);
+    if (to < padded_) std::memset(costs + to, pair_.outside, padded_ - to);
   }
 
  private:
-  // How many bits differ, of all pixels of a row at all disparities.
-  void compare(int64_t y, uint8_t* costs) {
+  int vectors() const { return kVectors ? kVectors : vectors_; }
+
+  // The words of a row of the right image in the order of disparities.
+  void describe(int64_t y) {
     const int64_t width = pair_.width, image = pair_.height * width, length = width + padded_;
     for (int64_t word = 0; word < pair_.words; ++word) {
       const uint32_t* right = pair_.right + word * image + y * width;
       uint32_t* reversed = &reversed_[word * length];
-      // What a match compares then lies in the order of disparities.
       for (int64_t i = 0; i < length; ++i)
         reversed[i] = right[std::clamp<int64_t>(width - 1 - pair_.first - i, 0, width - 1)];
     }
-    const uint32_t* left = pair_.left + y * width;
-    const int64_t padded = padded_;
-    for (int64_t x = 0; x < width; ++x, costs += padded) {
-      const uint32_t* here = &reversed_[width - 1 - x];
-      if (pair_.words == 2) {
-        const uint32_t a = left[x], b = left[image + x], scale = pair_.scale;
-        const uint32_t *as = here, *bs = here + length;
-        for (int64_t d = 0; d < padded; ++d)
-          costs[d] = uint8_t((__builtin_popcount(a ^ as[d]) + __builtin_popcount(b ^ bs[d])) * scale);
-      } else {
-        for (int64_t d = 0; d < padded; ++d) {
-          int bits = 0;
-          for (int64_t word = 0; word < pair_.words; ++word)
-            bits += __builtin_popcount(left[word * image + x] ^ here[word * length + d]);
-          costs[d] = uint8_t(bits * pair_.scale);
-        }
-      }
-    }
+    left_ = pair_.left + y * width;
   }
 
-  const uint8_t* raw(int64_t y) {
-    const int64_t slot = y % (pair_.block + 1);
-    uint8_t* row = &raw_[slot * pair_.width * padded_];
-    if (kept_[slot] != y) compare(y, row);
-    kept_[slot] = y;
-    return row;
-  }
-
-  void sum_columns(int64_t y, int64_t step) {
-    const int64_t reach = pair_.block / 2, last = pair_.height - 1, count = pair_.width * padded_;
-    uint16_t* columns = columns_.data();
-    if (!begun_) {
-      for (int64_t k = -reach; k <= reach; ++k) {
-        const uint8_t* come = raw(std::clamp<int64_t>(y + k, 0, last));
-        for (int64_t i = 0; i < count; ++i) columns[i] += come[i];
-      }
+  // How many bits differ, at all disparities.
+  void compare(int64_t x, uint8_t* costs) const {
+    const int64_t image = pair_.height * pair_.width, length = pair_.width + padded_, padded = vectors() * kBytes;
+    const uint32_t *left = left_ + x, *right = &reversed_[pair_.width - 1 - x];
+    if (pair_.words == 2) {
+      const uint32_t a = left[0], b = left[image], scale = pair_.scale;
+      const uint32_t *as = right, *bs = right + length;
+      for (int64_t d = 0; d < padded; ++d)
+        costs[d] = uint8_t((__builtin_popcount(a ^ as[d]) + __builtin_popcount(b ^ bs[d])) * scale);
     } else {
-      const int64_t before = std::clamp<int64_t>(y - step * (reach + 1), 0, last);
-      const int64_t after = std::clamp<int64_t>(y + step * reach, 0, last);
-      if (before == after) return;
-      const uint8_t *gone = raw(before), *come = raw(after);
-      for (int64_t i = 0; i < count; ++i) columns[i] = uint16_t(columns[i] + come[i] - gone[i]);
-    }
-    begun_ = true;
-  }
-
-  // Sums of columns become means of blocks.
-  void average(uint8_t* costs) {
-    const int64_t reach = pair_.block / 2, last = pair_.width - 1, padded = padded_;
-    const uint16_t* columns = columns_.data();
-    const uint16_t half = uint16_t(pair_.block * pair_.block / 2);
-    sums_.assign(padded, half);
-    uint16_t* sums = sums_.data();
-    for (int64_t k = -reach; k <= reach; ++k) {
-      const uint16_t* come = columns + std::clamp<int64_t>(k, 0, last) * padded;
-      for (int64_t d = 0; d < padded; ++d) sums[d] += come[d];
-    }
-    const uint32_t factor = factor_;
-    const int shift = shift_;
-    for (int64_t x = 0; x <= last; ++x, costs += padded) {
-      const uint16_t* gone = columns + std::max<int64_t>(x - reach, 0) * padded;
-      const uint16_t* come = columns + std::min<int64_t>(x + reach + 1, last) * padded;
       for (int64_t d = 0; d < padded; ++d) {
-        const uint16_t sum = sums[d];
-        costs[d] = uint8_t(uint16_t((sum * factor) >> 16) >> shift);  // sum / block^2
-        sums[d] = uint16_t(sum + come[d] - gone[d]);
+        int bits = 0;
+        for (int64_t word = 0; word < pair_.words; ++word)
+          bits += __builtin_popcount(left[word * image] ^ right[word * length + d]);
+        costs[d] = uint8_t(bits * pair_.scale);
       }
     }
   }
 
-  // The largest cost where the match lies outside the right image.
-  void mark_outside(uint8_t* costs) {
-    for (int64_t x = 0; x < pair_.width; ++x, costs += padded_) {
-      const int64_t from = std::clamp<int64_t>(x - pair_.first - (pair_.width - 1), 0, padded_);
-      const int64_t to = std::clamp<int64_t>(x - pair_.first + 1, from, padded_);
-      if (from > 0) std::memset(costs, pair_.outside, from);
-      if (to < padded_) std::memset(costs + to, pair_.outside, padded_ - to);
+  uint8_t* row_of(int64_t y) { return &raw_[y % (pair_.block + 1) * pair_.width * padded_]; }
+
+  // Costs of the row are compared unless they are held already, and added to the sums of the columns.
+  void start_column_sums(int64_t y) {
+    int64_t& held = held_[y % (pair_.block + 1)];
+    come_ = row_of(y);
+    is_new_ = held != y;
+    if (is_new_) describe(y);
+    held = y;
+    gone_ = nullptr;
+  }
+
+  uint16_t* column_of(int64_t x) { return &columns_[std::clamp<int64_t>(x, 0, pair_.width - 1) * padded_]; }
+
+  void add_to_column(int64_t x) {
+    if (come_ == nullptr) return;
+    uint8_t* come = come_ + x * padded_;
+    if (is_new_) compare(x, come);
+    uint16_t* column = column_of(x);
+    for (int k = 0; k < vectors(); ++k, column += kBytes) {
+      const Words more = (Words)load<Bytes>(come + k * kBytes);
+      Words even = load<Words>(column) + (more & 0xff), odd = load<Words>(column + kBytes / 2) + (more >> 8);
+      if (gone_ != nullptr) {
+        const Words less = (Words)load<Bytes>(gone_ + x * padded_ + k * kBytes);
+        even -= less & 0xff, odd -= less >> 8;
+      }
+      store(column, even), store(column + kBytes / 2, odd);
     }
   }
+
+  // A sum over the block, which half of it was added to, divided by its size.
+  Words mean(Words sums) const { return high_product(sums, factor_) >> shift_; }
 
   const Pair& pair_;
-  int64_t padded_;
+  int vectors_;
+  int64_t padded_, reach_;
+  const uint32_t* left_ = nullptr;
   std::vector<uint32_t> reversed_;
   std::vector<uint8_t> raw_;
-  std::vector<int64_t> kept_;
-  std::vector<uint16_t> columns_, sums_;
-  uint32_t factor_ = 0;
+  std::vector<int64_t> held_;
+  std::vector<uint16_t> columns_;
+  uint8_t *come_ = nullptr, *gone_ = nullptr;
+  Words even_[kVectors ? kVectors : 2048 / kBytes], odd_[kVectors ? kVectors : 2048 / kBytes];
+  uint16_t factor_ = 0;
   int shift_ = 0;
-  bool begun_ = false;
+  bool begun_ = false, is_new_ = false;
 };
 
 // ---- Paths ----
@@ -264,12 +309,11 @@ class Walk {
   static constexpr int kMost = kVectors ? kVectors : 2048 / kBytes;
 
   Walk(const Pair& pair, int64_t step, Room& room)
-      : pair_(pair), step_(step), vectors_((pair.disparities + kBytes - 1) / kBytes), costs_(pair, padded()) {
+      : pair_(pair), step_(step), vectors_((pair.disparities + kBytes - 1) / kBytes), costs_(pair, vectors()) {
     const int64_t ends = pair.width * stride() + kBytes, row = pair.width * padded();
-    uint8_t* memory = room.of(3 * ends + 4 * stride() + 2 * row);
+    uint8_t* memory = room.of(3 * ends + 2 * stride() + 2 * row);
     for (uint8_t*& path : paths_) path = begin(memory, pair.width), memory += ends;
     nowhere_ = begin(memory, 1), memory += 2 * stride();
-    along_ = begin(memory, 1), memory += 2 * stride();
     from_left_ = memory;
     given_ = memory + row;
     p1_ = p2_ = Bytes{};
@@ -284,20 +328,21 @@ class Walk {
 
   // The first half: makes the costs of a row, and keeps what all paths that have come so far add up to.
   void keep(int64_t y, uint8_t* costs, uint8_t* sums) {
-    if (pair_.costs == nullptr) costs_.row(y, step_, costs);
-    const uint8_t* row = costs_of(y, costs);
+    const bool given = pair_.costs != nullptr;
     const int64_t width = pair_.width, padded = this->padded();
-    Bytes added[kMost], passing[kMost];
-    start_along();
+    const uint8_t* row = given ? costs_of(y) : costs;
+    Bytes along[kMost] = {}, added[kMost], passing[kMost];
+    if (!given) costs_.start(y, step_);
     for (int64_t x = 0; x < width; ++x) {
-      go(along_, along_, row + x * padded, added);
+      if (!given) costs_.pixel(x, costs + x * padded);
+      go_along(along, row + x * padded, added);
       for (int k = 0; k < vectors(); ++k) store(from_left_ + x * padded + k * kBytes, added[k]);
     }
-    start_along();
+    std::memset(along, 0, sizeof(along));
     for (int64_t x = width - 1; x >= 0; --x) {
       const uint8_t* cost = row + x * padded;
       Words even[kMost], odd[kMost];
-      go(along_, along_, cost, added);
+      go_along(along, cost, added);
       for (int k = 0; k < vectors(); ++k) {
         const Words all = (Words)load<Bytes>(cost + k * kBytes);
         const Words sides = (Words)(added[k] + load<Bytes>(from_left_ + x * padded + k * kBytes));
@@ -313,7 +358,7 @@ class Walk {
 
   // The second half: adds the paths that come from this side to what was kept of the others.
   void finish(int64_t y, const uint8_t* costs, const uint8_t* sums, const Winners& winners) {
-    const uint8_t* row = costs_of(y, costs);
+    const uint8_t* row = pair_.costs ? costs_of(y) : costs;
     const int64_t padded = this->padded();
     Bytes added[kMost], passing[kMost];
     for (int64_t x = pair_.width - 1; x >= 0; --x) {
@@ -338,10 +383,8 @@ class Walk {
     return memory + kBytes;
   }
 
-  void start_along() { std::memset(along_, 0, padded()); }
-
-  const uint8_t* costs_of(int64_t y, const uint8_t* made) {
-    if (pair_.costs == nullptr) return made;
+  // A row of given costs.
+  const uint8_t* costs_of(int64_t y) {
     const uint8_t* row = pair_.costs + y * pair_.width * pair_.disparities;
     if (pair_.disparities == padded()) return row;
     for (int64_t x = 0; x < pair_.width; ++x)
@@ -351,16 +394,35 @@ class Walk {
 
   // A path comes to a pixel: what it adds to the costs there, and its end.
   inline void go(const uint8_t* from, uint8_t* to, const uint8_t* cost, Bytes* added) {
-    Bytes ends[kMost], lowest = {};
-    lowest -= 1;
+    Bytes ends[kMost];
     for (int k = 0; k < vectors(); ++k, from += kBytes) {
       const Bytes beside = lesser(load<Bytes>(from - 1), load<Bytes>(from + 1)) + p1_;
       added[k] = lesser(load<Bytes>(from), beside);
+    }
+    arrive(cost, added, ends);
+    for (int k = 0; k < vectors(); ++k) store(to + k * kBytes, ends[k]);
+  }
+
+  // The same along a row, where the end of the pixel before has just been made: in memory it would have to be awaited.
+  inline void go_along(Bytes* ends, const uint8_t* cost, Bytes* added) {
+    using Lanes = std::make_integer_sequence<int, kBytes>;
+    for (int k = 0; k < vectors(); ++k) {
+      const Bytes before = k > 0 ? ends[k - 1] : p2_, next = k + 1 < vectors() ? ends[k + 1] : p2_;
+      const Bytes beside = lesser(moved_up(before, ends[k], Lanes()), moved_down(ends[k], next, Lanes())) + p1_;
+      added[k] = lesser(ends[k], beside);
+    }
+    arrive(cost, added, ends);
+  }
+
+  inline void arrive(const uint8_t* cost, const Bytes* added, Bytes* ends) {
+    Bytes lowest = {};
+    lowest -= 1;
+    for (int k = 0; k < vectors(); ++k) {
       ends[k] = (load<Bytes>(cost + k * kBytes) + added[k]) | beyond_[k];
       lowest = lesser(lowest, ends[k]);
     }
     const uint8_t least = uint8_t(least_of(lowest));
-    for (int k = 0; k < vectors(); ++k) store(to + k * kBytes, lesser(ends[k] - least, p2_));
+    for (int k = 0; k < vectors(); ++k) ends[k] = lesser(ends[k] - least, p2_);
   }
 
   // The paths from the row before, of which those along a diagonal stay where they are in memory.
@@ -416,8 +478,8 @@ class Walk {
   const Pair& pair_;
   int64_t step_, rows_ = 0;
   int vectors_;
-  CensusCosts costs_;
-  uint8_t *paths_[3], *nowhere_, *along_, *from_left_, *given_;
+  CensusCosts<kBytes, kVectors> costs_;
+  uint8_t *paths_[3], *nowhere_, *from_left_, *given_;
   Bytes p1_, p2_, beyond_[kMost];
   Words numbers_;
 };
