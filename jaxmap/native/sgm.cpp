@@ -39,7 +39,6 @@ struct VectorOf {
   typedef Number type __attribute__((vector_size(kBytes)));
 };
 using Bytes16 = VectorOf<uint8_t, 16>::type;
-using Words16 = VectorOf<uint16_t, 16>::type;
 
 template <typename Vector>
 inline Vector load(const void* from) {
@@ -56,21 +55,6 @@ inline void store(void* to, Vector vector) {
 template <typename Vector>
 inline Vector lesser(Vector a, Vector b) {
   return a < b ? a : b;
-}
-
-inline int least_of(Words16 words) {
-#if defined(__SSE4_1__)
-  return _mm_cvtsi128_si32(_mm_minpos_epu16((__m128i)words)) & 0xffff;
-#else
-  int least = words[0];
-  for (int i = 1; i < 8; ++i) least = std::min<int>(least, words[i]);
-  return least;
-#endif
-}
-
-inline int least_of(Bytes16 bytes) {
-  const Words16 words = (Words16)bytes;
-  return least_of(lesser(words & 0xff, words >> 8));
 }
 
 // The upper half of the products of 16-bit numbers.
@@ -96,13 +80,35 @@ inline Bytes moved_down(Bytes here, Bytes next, std::integer_sequence<int, kLane
   return __builtin_shufflevector(here, next, (kLane + 1)...);
 }
 
-// Of a longer vector: halves are compared until 16 bytes are left.
+// The least lane of a vector, in all lanes of another: halves are compared until 16 bytes are left.
 template <typename Vector>
-inline int least_of(Vector vector) {
-  using Number = std::remove_reference_t<decltype(vector[0])>;
-  using Half = typename VectorOf<Number, sizeof(Vector) / 2>::type;
-  const char* bytes = reinterpret_cast<const char*>(&vector);
-  return least_of(lesser(load<Half>(bytes), load<Half>(bytes + sizeof(Half))));
+inline Vector least_of(Vector vector) {
+  using Number = std::decay_t<decltype(vector[0])>;
+  constexpr int kLeft = sizeof(Vector) / 16;
+  using Short = typename VectorOf<Number, 16>::type;
+  Short parts[kLeft];
+  std::memcpy(parts, &vector, sizeof(Vector));
+  for (int count = kLeft / 2; count > 0; count /= 2)
+    for (int i = 0; i < count; ++i) parts[i] = lesser(parts[i], parts[i + count]);
+#if defined(__SSE4_1__)
+  using Words = VectorOf<uint16_t, 16>::type;
+  Words words = (Words)parts[0];
+  if (sizeof(Number) == 1) words = (Words)lesser((Bytes16)words, (Bytes16)(words >> 8));  // its upper bytes are 0
+  const __m128i least = _mm_minpos_epu16((__m128i)words);
+#if defined(__AVX512BW__)
+  if constexpr (sizeof(Vector) == 64)
+    return (Vector)(sizeof(Number) == 1 ? _mm512_broadcastb_epi8(least) : _mm512_broadcastw_epi16(least));
+#endif
+#if defined(__AVX2__)
+  if constexpr (sizeof(Vector) == 32)
+    return (Vector)(sizeof(Number) == 1 ? _mm256_broadcastb_epi8(least) : _mm256_broadcastw_epi16(least));
+#endif
+  return Vector{} + Number(_mm_cvtsi128_si32(least));
+#else
+  Number least = parts[0][0];
+  for (size_t i = 1; i < 16 / sizeof(Number); ++i) least = std::min<Number>(least, parts[0][i]);
+  return Vector{} + least;
+#endif
 }
 
 // ---- What is matched ----
@@ -421,7 +427,7 @@ class Walk {
       ends[k] = (load<Bytes>(cost + k * kBytes) + added[k]) | beyond_[k];
       lowest = lesser(lowest, ends[k]);
     }
-    const uint8_t least = uint8_t(least_of(lowest));
+    const Bytes least = least_of(lowest);
     for (int k = 0; k < vectors(); ++k) ends[k] = lesser(ends[k] - least, p2_);
   }
 
@@ -455,13 +461,13 @@ class Walk {
       store(totals + k * kBytes, even[k]), store(totals + k * kBytes + kBytes / 2, odd[k]);
       lowest = lesser(lowest, lesser(even[k], odd[k]));
     }
-    const uint16_t cost = uint16_t(least_of(lowest));
+    const Words cost = least_of(lowest);
     lowest = most;
     for (int k = 0; k < vectors(); ++k) {
       const Words number = numbers_ + uint16_t(k * kBytes);
       lowest = lesser(lowest, lesser(even[k] == cost ? number : most, odd[k] == cost ? number + 1 : most));
     }
-    const int place = least_of(lowest);
+    const int place = least_of(lowest)[0];
     lowest = most;
     for (int k = 0; k < vectors(); ++k) {
       const Words apart = numbers_ + uint16_t(k * kBytes - place + 1);  // 0, 1 and 2 at the place and beside it
@@ -469,8 +475,8 @@ class Walk {
     }
     const auto total = [&](int d) { return totals[d / kBytes * kBytes + (d % 2) * (kBytes / 2) + d % kBytes / 2]; };
     winners.place[pixel] = int16_t(place);
-    winners.cost[pixel] = cost;
-    winners.second[pixel] = uint16_t(least_of(lowest));
+    winners.cost[pixel] = cost[0];
+    winners.second[pixel] = least_of(lowest)[0];
     winners.lower[pixel] = total(std::max(place - 1, 0));
     winners.higher[pixel] = total(std::min<int>(place + 1, int(pair_.disparities) - 1));
   }
