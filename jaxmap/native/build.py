@@ -23,10 +23,11 @@ import jax
 
 from jaxmap.host.cache import cache_folder
 
-TARGET, FUSE_TARGET, SGM_TARGET = "jaxmap_block", "jaxmap_fuse", "jaxmap_sgm"
-"""The kernels' names in compiled programs: blocks of convolutions, a frame into the map, semi-global matching."""
+TARGET, FUSE_TARGET = "jaxmap_block", "jaxmap_fuse"
+SGM_TARGET, SELECT_TARGET = "jaxmap_sgm", "jaxmap_select"
+"""The kernels' names in compiled programs: blocks of convolutions, a frame into the map, the two halves of matching."""
 
-_SOURCES = {TARGET: "blocks.cpp", FUSE_TARGET: "fuse.cpp", SGM_TARGET: "sgm.cpp"}
+_SOURCES = {TARGET: "blocks.cpp", FUSE_TARGET: "fuse.cpp", SGM_TARGET: "sgm.cpp", SELECT_TARGET: "select.cpp"}
 _COMPILERS = ("c++", "g++", "clang++")
 # Products and sums may be fused; nothing else may change what is computed.
 _FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-std=c++17", "-shared", "-fPIC", "-w")

@@ -609,7 +609,7 @@ ffi::Error call(ffi::ThreadPool pool, ffi::Buffer<ffi::U32> left, ffi::Buffer<ff
 
 }  // namespace
 
-extern "C" XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxmap_sgm, call,
+XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxmap_sgm, call,
                               ffi::Ffi::Bind()
                                   .Ctx<ffi::ThreadPool>()
                                   .Arg<ffi::Buffer<ffi::U32>>()

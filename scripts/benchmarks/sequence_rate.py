@@ -1,7 +1,7 @@
 """How near `jaxmap map` comes to the rate of its matcher alone, and what each stage of a frame costs the processors.
 
     python scripts/benchmarks/sequence_rate.py [SEQUENCE] [--frames 28] [--rounds 5] [--config F] [--labeller deeplab]
-        [--json F]
+        [--matcher sgm] [--json F]
 
 By default the bundled traverse (14 pairs of 1024 x 768 pixels, raw), its images written anew as PNG. In each round
 OpenCV's SGBM in its 3WAY mode goes over the rectified pairs in grey, as many disparities and no more, and then the
@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--config", help="YAML file, or the name of a bundled one")
     parser.add_argument("--labeller", choices=["none", "plane", "relief", "deeplab"])
+    parser.add_argument("--matcher", choices=["opencv", "sgm", "mccnn"])
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
@@ -58,6 +59,8 @@ def main() -> None:
     config = load_config(given.config) if given.config else MapConfig()
     if given.labeller:
         config = replace(config, labeller=given.labeller)
+    if given.matcher:
+        config = replace(config, stereo=replace(config.stereo, matcher=given.matcher))
     with tempfile.TemporaryDirectory() as folder:
         source = given.sequence or str(bundled_as_png(Path(folder, "traverse")))
         run = Run(plan_run(source, config, print), Path(folder))
@@ -100,10 +103,13 @@ class Run:
 
     def __init__(self, plan: Any, folder: Path) -> None:
         from jaxmap.mapping.step import compile_step
+        from jaxmap.stereo.match import Matcher, StereoOptions
 
         self.plan, self.folder, self.voxel_map = plan, folder, plan.mapper.init()
         self.mapper, self.cost = compile_step(plan.mapper, self.voxel_map, plan.frame_form, plan.params, plan.key)
         self.prepared = list(plan.prepare())
+        camera = plan.front_end.camera
+        self.sgbm = Matcher(StereoOptions(), camera.width_px).engine(camera.width_px * camera.height_px)
         self.grey = [[_grey(image) for image in one.rectified[:2]] for one in self.prepared]
 
     def indices(self, frames: int) -> list[int]:
@@ -112,10 +118,10 @@ class Run:
 
     def match(self, frames: int) -> tuple[float, float]:
         """Seconds on the clock and of the processors for SGBM alone."""
-        engine, spent = self.plan.front_end.matcher.engine(self.grey[0][0].size), Spent()
+        spent = Spent()
         with spent.stage("all"):
             for index in self.indices(frames):
-                engine.compute(*self.grey[index])
+                self.sgbm.compute(*self.grey[index])
         return spent["all"][0]
 
     def map(self, frames: int) -> tuple[float, float]:
@@ -156,14 +162,14 @@ class Run:
         with spent.stage("rectify"):
             left, right = front_end.rectify(*pair)
         with spent.stage("SGBM alone"):
-            front_end.matcher.engine(self.grey[index][0].size).compute(*self.grey[index])
+            self.sgbm.compute(*self.grey[index])
         with spent.stage("match, all in"):
             front_end.matcher(left, right)
         with spent.stage("near guard"):
             front_end.near_guard(left, right)
         with spent.stage("hand over"):
             to_device(as_rgb(left))
-            to_device(prepared.rectified.disparity_px)
+            to_device(as_rgb(right) if frame.disparity_px is None else frame.disparity_px)
         with spent.stage("step"):
             self.voxel_map, info = self.mapper.step(self.voxel_map, frame, plan.params, plan.key)
             jax.block_until_ready(self.voxel_map.log_odds)
