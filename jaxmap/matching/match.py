@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
@@ -9,10 +11,10 @@ from jaxtyping import Array, Float, Num
 from jaxmap.matching.aggregate import aggregate_planes
 from jaxmap.matching.costs import cost_planes, cost_volume
 from jaxmap.matching.design import MOST_P1, MOST_P2, MatchDesign, MatchParams
-from jaxmap.matching.kernel import winners_cpu
+from jaxmap.matching.kernel import decide_cpu, winners_cpu
 from jaxmap.matching.select import Winners, decide, winners
 from jaxmap.matching.soft import soft_match
-from jaxmap.native.build import SGM_TARGET, has_kernel
+from jaxmap.native.build import SELECT_TARGET, SGM_TARGET, has_kernel
 
 _SUBPIXELS = 16
 
@@ -35,7 +37,7 @@ def match(
     if design.soft:
         found = soft_match(design, left, right, params)
         return jnp.where(found.confidence >= 0.5, found.disparity_px, jnp.nan)
-    disparity_px = decide(design, find_winners(design, left, right, params), params)
+    disparity_px = leave_out_doubtful(design, find_winners(design, left, right, params), params)
     return jnp.round(disparity_px * _SUBPIXELS) / _SUBPIXELS
 
 
@@ -64,6 +66,14 @@ def find_winners(
     if jax.default_backend() != "cpu":
         by_device["cuda"] = by_paths
     return jax.lax.platform_dependent(left, right, default=by_rows, **by_device)
+
+
+def leave_out_doubtful(design: MatchDesign, winner: Winners, params: MatchParams) -> Float[Array, "H W"]:
+    """The disparities of winners that nothing makes doubtful, by a kernel where there is one, bit for bit the same."""
+    plain = partial(decide, design)
+    if not (design.kernels and has_kernel(SELECT_TARGET)):
+        return plain(winner, params)
+    return jax.lax.platform_dependent(winner, params, cpu=partial(decide_cpu, design), default=plain)
 
 
 def penalties(design: MatchDesign, params: MatchParams) -> tuple[Array, Array]:

@@ -103,14 +103,17 @@ def agrees(
 
 def drop_speckles(design: MatchDesign, disparity_px: Float[Array, "H W"]) -> Float[Array, "H W"]:
     """Without blobs of few pixels: they are mostly false, and what stands on the ground is no blob."""
-    most = design.speckle_window_px
-    if most is None:
-        most = usual_speckle_px(disparity_px.size)
+    most = most_speckle_px(design, disparity_px.size)
     return drop_blobs(disparity_px, design.speckle_range_px, most) if most else disparity_px
 
 
+def most_speckle_px(design: MatchDesign, image_px: int) -> int:
+    """The most pixels of a blob that is dropped; 0 for none."""
+    return usual_speckle_px(image_px) if design.speckle_window_px is None else design.speckle_window_px
+
+
 def usual_speckle_px(image_px: int) -> int:
-    """The most pixels of a blob that is dropped, in images of so many pixels."""
+    """The same where nothing says otherwise, in images of so many pixels."""
     return max(round(image_px * _SPECKLE_SHARE), _LEAST_SPECKLE_PX)
 
 

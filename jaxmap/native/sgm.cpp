@@ -7,14 +7,11 @@
 // its paths and those that are kept make the whole, of which only the winner is written.
 
 #include <algorithm>
-#include <atomic>
-#include <condition_variable>
 #include <cstdint>
-#include <cstdlib>
 #include <cstring>
-#include <functional>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -22,15 +19,17 @@
 #if defined(__SSE4_1__)
 #include <immintrin.h>
 #endif
-#if defined(__linux__)
-#include <sys/mman.h>
-#endif
 
+#include "threads.h"
+#include "vectors.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;
 
 namespace {
+
+using jaxmap::in_parallel;
+using jaxmap::Scratch;
 
 // ---- Vectors ----
 
@@ -127,32 +126,6 @@ struct Winners {
   uint16_t *cost, *second, *lower, *higher;
 };
 
-// Memory that is kept from image to image: fresh pages cost more than what is done with them.
-class Room {
- public:
-  Room() = default;
-  Room(const Room&) = delete;
-  ~Room() { std::free(data_); }
-
-  uint8_t* of(int64_t size) {
-    if (size > size_) {
-      constexpr int64_t kPage = 1 << 21;
-      std::free(data_);
-      size_ = (size + kPage - 1) / kPage * kPage;
-      data_ = static_cast<uint8_t*>(std::aligned_alloc(kPage, size_));
-      if (data_ == nullptr) throw std::bad_alloc();
-#if defined(MADV_HUGEPAGE)
-      madvise(data_, size_, MADV_HUGEPAGE);
-#endif
-    }
-    return data_;
-  }
-
- private:
-  uint8_t* data_ = nullptr;
-  int64_t size_ = 0;
-};
-
 // ---- Costs of the census ----
 
 // Row by row, in the order of a walk; each is the mean over a block, whose edges are repeated.
@@ -237,12 +210,12 @@ class CensusCosts {
   }
 
   // How many bits differ, at all disparities.
-  void compare(int64_t x, uint8_t* costs) const {
+  void compare(int64_t x, uint8_t* __restrict costs) const {
     const int64_t image = pair_.height * pair_.width, length = pair_.width + padded_, padded = vectors() * kBytes;
     const uint32_t *left = left_ + x, *right = &reversed_[pair_.width - 1 - x];
     if (pair_.words == 2) {
       const uint32_t a = left[0], b = left[image], scale = pair_.scale;
-      const uint32_t *as = right, *bs = right + length;
+      const uint32_t *__restrict as = right, *__restrict bs = right + length;
       for (int64_t d = 0; d < padded; ++d)
         costs[d] = uint8_t((__builtin_popcount(a ^ as[d]) + __builtin_popcount(b ^ bs[d])) * scale);
     } else {
@@ -314,7 +287,7 @@ class Walk {
   using Words = typename VectorOf<uint16_t, kBytes>::type;
   static constexpr int kMost = kVectors ? kVectors : 2048 / kBytes;
 
-  Walk(const Pair& pair, int64_t step, Room& room)
+  Walk(const Pair& pair, int64_t step, Scratch<uint8_t>& room)
       : pair_(pair), step_(step), vectors_((pair.disparities + kBytes - 1) / kBytes), costs_(pair, vectors()) {
     const int64_t ends = pair.width * stride() + kBytes, row = pair.width * padded();
     uint8_t* memory = room.of(3 * ends + 2 * stride() + 2 * row);
@@ -333,7 +306,7 @@ class Walk {
   int64_t padded() const { return vectors() * kBytes; }
 
   // The first half: makes the costs of a row, and keeps what all paths that have come so far add up to.
-  void keep(int64_t y, uint8_t* costs, uint8_t* sums) {
+  [[gnu::noinline]] void keep(int64_t y, uint8_t* costs, uint8_t* sums) {
     const bool given = pair_.costs != nullptr;
     const int64_t width = pair_.width, padded = this->padded();
     const uint8_t* row = given ? costs_of(y) : costs;
@@ -363,7 +336,7 @@ class Walk {
   }
 
   // The second half: adds the paths that come from this side to what was kept of the others.
-  void finish(int64_t y, const uint8_t* costs, const uint8_t* sums, const Winners& winners) {
+  [[gnu::noinline]] void finish(int64_t y, const uint8_t* costs, const uint8_t* sums, const Winners& winners) {
     const uint8_t* row = pair_.costs ? costs_of(y) : costs;
     const int64_t padded = this->padded();
     Bytes added[kMost], passing[kMost];
@@ -492,32 +465,8 @@ class Walk {
 
 // ---- Two walks that meet in the middle ----
 
-// Does work(0) and work(1), side by side where a thread of XLA is idle.
-void in_pair(ffi::ThreadPool& pool, const std::function<void(int)>& work) {
-  struct Shared {
-    std::function<void(int)> work;
-    std::atomic<int> next{0};
-    int done = 0;
-    std::mutex mutex;
-    std::condition_variable finished;
-    void run() {
-      for (int index; (index = next.fetch_add(1)) < 2;) {
-        work(index);
-        std::lock_guard<std::mutex> lock(mutex);
-        if (++done == 2) finished.notify_all();
-      }
-    }
-  };
-  auto shared = std::make_shared<Shared>();
-  shared->work = work;
-  if (pool.num_threads() > 1) pool.Schedule([shared] { shared->run(); });
-  shared->run();
-  std::unique_lock<std::mutex> lock(shared->mutex);
-  shared->finished.wait(lock, [&] { return shared->done == 2; });
-}
-
 struct Workspace {
-  Room costs, sums, walks[2];
+  Scratch<uint8_t> costs, sums, walks[2];
 };
 
 template <int kBytes, int kVectors>
@@ -528,21 +477,14 @@ void match(ffi::ThreadPool& pool, const Pair& pair, Workspace& work, const Winne
   uint8_t* costs = pair.costs ? nullptr : work.costs.of(pair.height * row);
   uint8_t* sums = work.sums.of(2 * pair.height * row);
   const auto costs_at = [&](int64_t y) { return costs ? costs + y * row : nullptr; };
-  in_pair(pool, [&](int side) {
-    HalfWalk& walk = walks[side];
-    if (side == 0) {
-      for (int64_t y = 0; y < middle; ++y) walk.keep(y, costs_at(y), sums + 2 * y * row);
-    } else {
-      for (int64_t y = last; y >= middle; --y) walk.keep(y, costs_at(y), sums + 2 * y * row);
-    }
+  // From the outermost row of a half to the middle, and on through the other half.
+  in_parallel(pool, 2, [&](int64_t side) {
+    const int64_t begin = side ? last : 0, end = side ? middle - 1 : middle, step = side ? -1 : 1;
+    for (int64_t y = begin; y != end; y += step) walks[side].keep(y, costs_at(y), sums + 2 * y * row);
   });
-  in_pair(pool, [&](int side) {
-    HalfWalk& walk = walks[side];
-    if (side == 0) {
-      for (int64_t y = middle; y <= last; ++y) walk.finish(y, costs_at(y), sums + 2 * y * row, winners);
-    } else {
-      for (int64_t y = middle - 1; y >= 0; --y) walk.finish(y, costs_at(y), sums + 2 * y * row, winners);
-    }
+  in_parallel(pool, 2, [&](int64_t side) {
+    const int64_t begin = side ? middle - 1 : middle, end = side ? -1 : last + 1, step = side ? -1 : 1;
+    for (int64_t y = begin; y != end; y += step) walks[side].finish(y, costs_at(y), sums + 2 * y * row, winners);
   });
 }
 

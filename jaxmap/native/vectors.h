@@ -8,6 +8,10 @@
 #include <cstring>
 #include <new>
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 namespace jaxmap {
 
 #if defined(__AVX512F__)
@@ -40,6 +44,8 @@ inline void store_some(float* to, Vector value, int64_t count) {
   std::memcpy(to, &value, count * sizeof(float));
 }
 
+constexpr size_t kLargePage = 1 << 21;
+
 // An array that a thread or a workspace keeps from call to call, as fresh pages cost more than what is done with them.
 // It grows, and then forgets what it held.
 template <typename Number>
@@ -48,8 +54,13 @@ class Scratch {
   Number* of(int64_t count) {
     if (count > size_) {
       std::free(numbers_);
-      const size_t bytes = (count * sizeof(Number) + 63) / 64 * 64;
-      numbers_ = static_cast<Number*>(std::aligned_alloc(64, bytes));
+      // Much memory comes in large pages, where the system has them: fewer addresses to look up.
+      const size_t wanted = count * sizeof(Number), page = wanted < kLargePage ? 64 : kLargePage;
+      const size_t bytes = (wanted + page - 1) / page * page;
+      numbers_ = static_cast<Number*>(std::aligned_alloc(page, bytes));
+#if defined(MADV_HUGEPAGE)
+      if (numbers_ && page == kLargePage) madvise(numbers_, bytes, MADV_HUGEPAGE);
+#endif
       size_ = numbers_ ? count : 0;
       if (!numbers_) throw std::bad_alloc();
     }
