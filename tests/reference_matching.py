@@ -33,6 +33,32 @@ def census_cost(left: np.ndarray, right: np.ndarray, disparities: range, window_
     return cost
 
 
+def mean_census_costs(
+    left: np.ndarray, right: np.ndarray, disparities: range, window_px: tuple[int, int], block: int, steps: int
+) -> np.ndarray:
+    """The same in so many steps, each the mean over a block, rounded half up; what lies outside is as its nearest."""
+    height, width = left.shape
+    reach, bits = block // 2, window_px[0] * window_px[1] - 1
+    # As wide as any match goes, so that nothing is outside yet.
+    margin = max(abs(disparities[0]), abs(disparities[-1])) + 1
+
+    def codes(image: np.ndarray) -> np.ndarray:
+        rows, columns = (size // 2 for size in window_px)
+        around = np.pad(image, ((rows, rows), (columns, columns)), "edge")
+        near = np.lib.stride_tricks.sliding_window_view(around, window_px)
+        return (near < image[..., None, None]).reshape(height, width, -1)
+
+    there = np.pad(codes(right), ((0, 0), (margin, margin), (0, 0)), "edge")
+    costs = np.stack(
+        [(codes(left) != there[:, margin - d : margin - d + width]).sum(-1) * (steps // bits) for d in disparities], -1
+    )
+    around = np.pad(costs, ((reach, reach), (reach, reach), (0, 0)), "edge")
+    sums = np.lib.stride_tricks.sliding_window_view(around, (block, block), (0, 1)).sum((-1, -2))
+    means = (sums + block**2 // 2) // block**2
+    column = np.arange(width)[:, None] - np.array(disparities)
+    return np.where((column >= 0) & (column < width), means, steps)
+
+
 def birchfield_tomasi_cost(left: np.ndarray, right: np.ndarray, disparities: range, cap: int) -> np.ndarray:
     """Of truncated gradients and of quarters of grey levels, (H, W, D); the largest outside the right image."""
 
@@ -78,6 +104,16 @@ def aggregate(volume: np.ndarray, p1: float, p2: float, paths: int) -> np.ndarra
                     end[v, u, d] += min(steps) - before.min()
         total += end
     return total
+
+
+def winners(total: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of each pixel the cheapest place, its cost, the least cost that is not beside it, and the two that are."""
+    last = total.shape[2] - 1
+    place = total.argmin(2)
+    apart = np.abs(np.arange(last + 1) - place[..., None]) > 1
+    second = np.where(apart, total, np.iinfo(np.uint16).max).min(2)
+    costs = [np.take_along_axis(total, np.clip(place + step, 0, last)[..., None], 2)[..., 0] for step in (0, -1, 1)]
+    return place, costs[0], second, *costs[1:]
 
 
 def select(total: np.ndarray, first: int, uniqueness: float, left_right: float) -> np.ndarray:

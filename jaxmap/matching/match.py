@@ -44,7 +44,7 @@ def match(
 def find_winners(
     design: MatchDesign, left: Num[Array, "H W"], right: Num[Array, "H W"], params: MatchParams
 ) -> Winners:
-    """The cheapest disparities of two grey images; by kernels made for the device where there are, bit for bit the same."""
+    """The cheapest disparities of two grey images, by the device's own kernels if it has some; bit for bit alike."""
     p1, p2 = penalties(design, params)
 
     def by_rows(left: Array, right: Array) -> Winners:
@@ -69,7 +69,7 @@ def find_winners(
 
 
 def leave_out_doubtful(design: MatchDesign, winner: Winners, params: MatchParams) -> Float[Array, "H W"]:
-    """The disparities of winners that nothing makes doubtful, by a kernel where there is one, bit for bit the same."""
+    """The disparities of winners that nothing makes doubtful; likewise."""
     plain = partial(decide, design)
     if not (design.kernels and has_kernel(SELECT_TARGET)):
         return plain(winner, params)

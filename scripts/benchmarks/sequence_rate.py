@@ -63,7 +63,7 @@ def main() -> None:
         config = replace(config, stereo=replace(config.stereo, matcher=given.matcher))
     with tempfile.TemporaryDirectory() as folder:
         source = given.sequence or str(bundled_as_png(Path(folder, "traverse")))
-        run = Run(plan_run(source, config, print), Path(folder))
+        run = Run(plan_run(source, config, print, match_in_step=True), Path(folder))
         run.map(4)
         figures: dict[str, Any] = {"device": jax.devices()[0].device_kind, "stages": run.stages()}
         rounds = [(run.match(given.frames), run.map(given.frames)) for _ in range(given.rounds)]
