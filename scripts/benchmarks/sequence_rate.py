@@ -181,8 +181,9 @@ class Run:
                 labels = np.asarray(plan.mapper.label_image(frame, plan.params, plan.key, 1))
         folder = RunFolder(self.folder / "run")
         folder.pictures.mkdir(parents=True, exist_ok=True)
+        matched = front_end.matched(prepared.rectified)
         with spent.stage("picture of a key frame"):
-            write_key_frame(folder, index, prepared.rectified, labels, plan.labeller.classes, large=False)
+            write_key_frame(folder, index, matched, labels, plan.labeller.classes, large=False)
 
 
 def _grey(image: np.ndarray) -> np.ndarray:
