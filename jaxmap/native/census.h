@@ -109,8 +109,13 @@ class CensusCosts {
     if (pair_.words == 2) {
       const uint32_t a = left[0], b = left[image], scale = pair_.scale;
       const uint32_t *__restrict as = right, *__restrict bs = right + length;
+#if defined(__AVX512VPOPCNTDQ__)
       for (int64_t d = 0; d < padded; ++d)
         costs[d] = uint8_t((__builtin_popcount(a ^ as[d]) + __builtin_popcount(b ^ bs[d])) * scale);
+#else  // one by one, so both words at once
+      for (int64_t d = 0; d < padded; ++d)
+        costs[d] = uint8_t(__builtin_popcountll(uint64_t(b ^ bs[d]) << 32 | (a ^ as[d])) * scale);
+#endif
     } else {
       for (int64_t d = 0; d < padded; ++d) {
         int bits = 0;

@@ -32,6 +32,8 @@ struct Winners {
   uint16_t *cost, *second, *lower, *higher;
 };
 
+constexpr int vectors_for(int64_t disparities, int bytes) { return int((disparities + bytes - 1) / bytes); }
+
 // ---- Paths ----
 
 // A walk over the rows, down or up, with the ends of the paths that come its way: of each the costs above the least,
@@ -44,7 +46,7 @@ class Walk {
   static constexpr int kMost = kVectors ? kVectors : 2048 / kBytes;
 
   Walk(const Pair& pair, int64_t step, Scratch<uint8_t>& room)
-      : pair_(pair), step_(step), vectors_((pair.disparities + kBytes - 1) / kBytes), costs_(pair, vectors()) {
+      : pair_(pair), step_(step), vectors_(vectors_for(pair.disparities, kBytes)), costs_(pair, vectors()) {
     const int64_t ends = pair.width * stride() + kBytes, row = pair.width * padded();
     uint8_t* memory = room.of(3 * ends + 2 * stride() + 2 * row);
     for (uint8_t*& path : paths_) path = begin(memory, pair.width), memory += ends;
@@ -86,8 +88,10 @@ class Walk {
       }
       come(x, cost, even, odd, added, passing);
       uint8_t* sum = sums + 2 * x * padded;
-      for (int k = 0; k < vectors(); ++k, sum += 2 * kBytes) store(sum, even[k]), store(sum + kBytes, odd[k]);
+      for (int k = 0; k < vectors(); ++k, sum += 2 * kBytes)
+        store_for_later(sum, even[k]), store_for_later(sum + kBytes, odd[k]);
     }
+    all_stored();
     ++rows_;
   }
 
@@ -244,19 +248,23 @@ void match(ffi::ThreadPool& pool, const Pair& pair, Workspace& work, const Winne
   });
 }
 
-// Vectors of 64 bytes, or of 32 where those hold the disparities with less to spare.
-void match_any(ffi::ThreadPool& pool, const Pair& pair, Workspace& work, const Winners& winners) {
-  const int64_t by_32 = (pair.disparities + 31) / 32, by_64 = (pair.disparities + 63) / 64;
-  if (by_32 == 2 * by_64) {
-    if (by_64 == 1) return match<64, 1>(pool, pair, work, winners);
-    if (by_64 == 2) return match<64, 2>(pool, pair, work, winners);
-    if (by_64 == 3) return match<64, 3>(pool, pair, work, winners);
-    return match<64, 0>(pool, pair, work, winners);
+template <int kBytes>
+void match_by(ffi::ThreadPool& pool, const Pair& pair, Workspace& work, const Winners& winners) {
+  switch (vectors_for(pair.disparities, kBytes)) {
+    case 1: return match<kBytes, 1>(pool, pair, work, winners);
+    case 2: return match<kBytes, 2>(pool, pair, work, winners);
+    case 3: return match<kBytes, 3>(pool, pair, work, winners);
+    case 4: return match<kBytes, 4>(pool, pair, work, winners);
+    default: return match<kBytes, 0>(pool, pair, work, winners);
   }
-  if (by_32 == 1) return match<32, 1>(pool, pair, work, winners);
-  if (by_32 == 3) return match<32, 3>(pool, pair, work, winners);
-  if (by_32 == 5) return match<32, 5>(pool, pair, work, winners);
-  return match<32, 0>(pool, pair, work, winners);
+}
+
+// By vectors as long as the processor's, or half as long where those hold the disparities with less to spare.
+void match_any(ffi::ThreadPool& pool, const Pair& pair, Workspace& work, const Winners& winners) {
+  constexpr int kHalf = kWidest / 2;
+  if (vectors_for(pair.disparities, kHalf) < 2 * vectors_for(pair.disparities, kWidest))
+    return match_by<kHalf>(pool, pair, work, winners);
+  match_by<kWidest>(pool, pair, work, winners);
 }
 
 class Kept {

@@ -14,6 +14,12 @@
 
 namespace jaxmap {
 
+#if defined(__AVX512BW__)
+constexpr int kWidest = 64;
+#else
+constexpr int kWidest = 32;
+#endif
+
 template <typename Number, int kBytes>
 struct VectorOf {
   typedef Number type __attribute__((vector_size(kBytes)));
@@ -29,6 +35,24 @@ inline Vector load(const void* from) {
 template <typename Vector>
 inline void store(void* to, Vector vector) {
   std::memcpy(to, &vector, sizeof(Vector));
+}
+
+// To memory past the caches, for what is read much later; `to` must be aligned, and `all_stored` called after the last.
+template <typename Vector>
+inline void store_for_later(void* to, Vector vector) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(Vector) == 64) return _mm512_stream_si512(static_cast<__m512i*>(to), (__m512i)vector);
+#endif
+#if defined(__AVX__)
+  if constexpr (sizeof(Vector) == 32) return _mm256_stream_si256(static_cast<__m256i*>(to), (__m256i)vector);
+#endif
+  store(to, vector);
+}
+
+inline void all_stored() {
+#if defined(__AVX__)
+  _mm_sfence();
+#endif
 }
 
 template <typename Vector>
