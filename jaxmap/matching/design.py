@@ -28,7 +28,7 @@ class MatchDesign:
         num_disparities: disparities searched, one pixel apart.
         paths: directions of the aggregation, 4 or 8.
         soft: minima are soft and gradients reach all numbers; else costs are small integers.
-        kernels: a CUDA device matches by kernels made for it, bit for bit the same (not in soft mode).
+        kernels: CPUs and CUDA devices match by kernels made for them, bit for bit the same (not in soft mode).
         census_window_px: rows and columns that the census compares with the centre, odd.
         block_size: edge of the square over which costs are averaged, odd; 1 for none.
         pre_filter_cap: truncation of the image gradient (Birchfield-Tomasi).

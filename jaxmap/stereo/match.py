@@ -49,8 +49,8 @@ class StereoOptions:
     temperature: Annotated[float, Interval(ge=1e-4, le=10)] = 0.05
     """How soft, in units of the cost."""
     kernels: bool = True
-    """matchers sgm, mccnn, on a CUDA device: kernels made for it, which need compute capability 8.0 (Ampere); without
-    them the same disparities take thirty times as long."""
+    """matchers sgm, mccnn: kernels made for the device; a CPU's need a C++ compiler, a CUDA device's compute capability
+    8.0 (Ampere). Without them the same disparities take ten times as long or more."""
     cost_network: Path | None = None
     """matcher mccnn: a file of the network's weights (.safetensors, .pt, .onnx); by default those that come with the
     package mccnn."""
