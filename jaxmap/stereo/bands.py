@@ -7,6 +7,8 @@ rows in a band: the full images are matched as ever within these bounds.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from jaxmap.stereo.coarse import Coarse
@@ -20,8 +22,8 @@ LEAST_KNOWN = 0.5
 """Where small images match less than this share of the pixels, they do not tell what there is."""
 
 _FIXED_COST, _FIXED_ROWS = 30, 40
-"""What OpenCV spends on a row whatever is searched there, in disparities; and the rows that a band costs beside its own:
-those it shares with the one above, and those between the four parts that OpenCV makes of it."""
+"""What OpenCV spends on a row whatever is searched there, in disparities; and the rows that a band costs beside its
+own: those it shares with the one above, and those between the four parts that OpenCV makes of it."""
 
 
 def search_bands(coarse: Coarse, matcher: Matcher, height_px: int) -> tuple[Band, ...]:
@@ -36,7 +38,7 @@ def search_bands(coarse: Coarse, matcher: Matcher, height_px: int) -> tuple[Band
         height_px: of the full images.
     """
     edges = np.linspace(0, height_px, max(round(height_px / STEP_ROWS), 1) + 1).astype(int).tolist()
-    bounds = [_bounds(coarse, matcher, first, end) for first, end in zip(edges, edges[1:], strict=False)]
+    bounds = [_bounds(coarse, matcher, first, end) for first, end in pairwise(edges)]
     # For each edge: what the rows above it cost at least, and the bands that do so.
     best: list[tuple[float, tuple[Band, ...]]] = [(0.0, ())]
     for last, end in enumerate(edges[1:]):
@@ -46,7 +48,7 @@ def search_bands(coarse: Coarse, matcher: Matcher, height_px: int) -> tuple[Band
             least_px, limit_px = min(least_px, bounds[start][0]), max(limit_px, bounds[start][1])
             band = matcher.band(edges[start], end, least_px, limit_px)
             cost, above = best[start]
-            ways.append((cost + (end - edges[start] + _FIXED_ROWS) * (_FIXED_COST + band.count), (*above, band)))
+            ways.append((cost + (end - edges[start] + _FIXED_ROWS) * (_FIXED_COST + band.disparities), (*above, band)))
         best.append(min(ways))
     return best[-1][1]
 

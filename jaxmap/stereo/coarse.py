@@ -55,5 +55,5 @@ class CoarseMatcher:
             left: uint8, (H, W) or (H, W, 3) RGB.
             right: likewise.
         """
-        small = (shrunk_grey(image, self._shrink) for image in (left, right))
-        return Coarse(self._shrink * self._matcher(*small), self._shrink)
+        small_left, small_right = (shrunk_grey(image, self._shrink) for image in (left, right))
+        return Coarse(self._shrink * self._matcher(small_left, small_right), self._shrink)

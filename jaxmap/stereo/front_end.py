@@ -13,8 +13,8 @@ from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.align import alignment_homography, estimate_alignment, match_features
-from jaxmap.stereo.blank import blank_reason
 from jaxmap.stereo.bands import search_bands
+from jaxmap.stereo.blank import blank_reason
 from jaxmap.stereo.coarse import CoarseMatcher
 from jaxmap.stereo.jax_matcher import JaxMatcher, make_matcher
 from jaxmap.stereo.match import Band, Matcher, StereoOptions, as_grey
@@ -28,10 +28,11 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    The images are empty where observations, which hold none, are read again; the disparity is None where the compiled
-    step finds it. `blind` are pixels that have none, whatever the images show: the raw image does not reach there, or
-    something is too near; `bands` say which disparities to search where. `too_near` is the share of pixels that were left out because they are nearer than the
-    searched disparities reach, and `nearest_px` the disparity of the nearest of them.
+    The images are empty where observations, which hold none, are read again; the right one is grey where OpenCV matches.
+    The disparity is None where the compiled step finds it. `blind` are pixels that have none, whatever the images
+    show: the raw image does not reach there, or something is too near; `bands` say which disparities are searched where.
+    `too_near` is the share of pixels that were left out because they are nearer than all that is searched, and
+    `nearest_px` the disparity of the nearest of them.
     """
 
     left: np.ndarray
@@ -55,8 +56,8 @@ class StereoFrontEnd:
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
         alignment_rad: rotation vector by which the rectified right camera is corrected, or None.
         matcher: of the rectified images.
-        coarse: matches small images, which tell what is too near for the matcher and what it need not search; None where
-            neither was asked for.
+        coarse: matches small images, which tell what is too near for the matcher, and what it need not search; None
+            where neither was asked for.
     """
 
     def __init__(
@@ -115,7 +116,8 @@ class StereoFrontEnd:
             for side, image in (("left", left), ("right", right)):
                 if (reason := blank_reason(image)) is not None:
                     raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
-            left, right = self.rectify(left, right)
+            # OpenCV's matcher takes grey images; nothing else looks at the right one, which is a third to rectify then.
+            left, right = self.rectify(left, as_grey(right) if isinstance(self.matcher, Matcher) else right)
         blind = None if self.rectifier is None else ~self.rectifier.seen
         frame = RectifiedFrame(left, right, None, stages_s["rectify"], 0.0, blind=blind)
         with timed_stage("match", stages_s):

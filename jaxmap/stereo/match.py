@@ -138,12 +138,12 @@ class StereoOptions:
 
 
 class Band(NamedTuple):
-    """Rows of an image, from `first` to before `end`, and the disparities searched in them: `count` from `least_px`."""
+    """Rows of an image, `first` to before `end`, and how many disparities are searched in them, from `least_px` on."""
 
     first: int
     end: int
     least_px: int
-    count: int
+    disparities: int
 
 
 class Matcher:
@@ -216,7 +216,7 @@ class Matcher:
 
         above = min(OVERLAP_ROWS, band.first)
         rows = slice(band.first - above, band.end + self.options.block_size // 2 + 1)
-        pad = max(band.count + band.least_px, 0) if self.options.pad_left else 0
+        pad = max(band.disparities + band.least_px, 0) if self.options.pad_left else 0
         padded = (cv2.copyMakeBorder(image[rows], 0, 0, pad, 0, cv2.BORDER_REPLICATE) for image in (left, right))
         found = self.engine(band).compute(*padded)[above : above + band.end - band.first, pad:]
         # OpenCV's own mark of the unknown is less than all that is searched.
@@ -268,10 +268,10 @@ class Matcher:
             )
         engine, band = self._local.engine, band or self.band(0, 0)
         engine.setMinDisparity(band.least_px)
-        engine.setNumDisparities(band.count)
+        engine.setNumDisparities(band.disparities)
         # OpenCV raises anything below 1 to 1, so a difference that never occurs turns the check off.
         unchecked = options.left_right_max_diff_px < 0
-        engine.setDisp12MaxDiff(band.count + 1 if unchecked else options.left_right_max_diff_px)
+        engine.setDisp12MaxDiff(band.disparities + 1 if unchecked else options.left_right_max_diff_px)
         return engine
 
 

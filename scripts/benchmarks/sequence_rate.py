@@ -100,11 +100,13 @@ class Run:
 
     def __init__(self, plan: Any, folder: Path) -> None:
         from jaxmap.mapping.step import compile_step
+        from jaxmap.stereo.match import as_grey
 
         self.plan, self.folder, self.voxel_map = plan, folder, plan.mapper.init()
         self.mapper, self.cost = compile_step(plan.mapper, self.voxel_map, plan.frame_form, plan.params, plan.key)
         self.prepared = list(plan.prepare())
-        self.grey = [[_grey(image) for image in one.rectified[:2]] for one in self.prepared]
+        self.grey = [[as_grey(image) for image in one.rectified[:2]] for one in self.prepared]
+        self.sgbm = _sgbm(plan.front_end.matcher.options, *self.grey[0][0].shape)
 
     def indices(self, frames: int) -> list[int]:
         """So many frames, those of the sequence in turn."""
@@ -112,10 +114,10 @@ class Run:
 
     def match(self, frames: int) -> tuple[float, float]:
         """Seconds on the clock and of the processors for SGBM alone."""
-        engine, spent = self.plan.front_end.matcher.engine(self.grey[0][0].size), Spent()
+        spent = Spent()
         with spent.stage("all"):
             for index in self.indices(frames):
-                engine.compute(*self.grey[index])
+                self.sgbm.compute(*self.grey[index])
         return spent["all"][0]
 
     def map(self, frames: int) -> tuple[float, float]:
@@ -143,7 +145,9 @@ class Run:
         from jaxmap.mapping.sequence import FusedFrame
         from jaxmap.runs.folder import RunFolder, write_key_frame
         from jaxmap.runs.log import RunLog
+        from jaxmap.stereo.bands import search_bands
         from jaxmap.stereo.blank import blank_reason
+        from jaxmap.stereo.match import as_grey
         from jaxmap.types import to_device
 
         plan, prepared, log = self.plan, self.prepared[index], RunLog()
@@ -154,13 +158,16 @@ class Run:
             for image in pair:
                 blank_reason(image)
         with spent.stage("rectify"):
-            left, right = front_end.rectify(*pair)
+            left, right = front_end.rectify(pair.left, as_grey(pair.right))
         with spent.stage("SGBM alone"):
-            front_end.matcher.engine(self.grey[index][0].size).compute(*self.grey[index])
-        with spent.stage("match, all in"):
+            self.sgbm.compute(*self.grey[index])
+        with spent.stage("match everything"):
             front_end.matcher(left, right)
-        with spent.stage("near guard"):
-            front_end.near_guard(left, right)
+        with spent.stage("small images"):
+            coarse = front_end.coarse(left, right)
+            bands = search_bands(coarse, front_end.matcher, left.shape[0])
+        with spent.stage("match what they show"):
+            front_end.matcher(left, right, bands)
         with spent.stage("hand over"):
             to_device(as_rgb(left))
             to_device(prepared.rectified.disparity_px)
@@ -179,10 +186,15 @@ class Run:
             write_key_frame(folder, index, prepared.rectified, labels, plan.labeller.classes, large=False)
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
-    import cv2
+def _sgbm(options: Any, height_px: int, width_px: int) -> Any:
+    """OpenCV's matcher, of all disparities, with its own removal of speckles."""
+    from jaxmap.matching.select import usual_speckle_px
+    from jaxmap.stereo.match import Matcher
 
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    sgbm = Matcher(options, width_px).engine()
+    sgbm.setSpeckleWindowSize(usual_speckle_px(height_px * width_px))
+    sgbm.setSpeckleRange(options.speckle_range_px)
+    return sgbm
 
 
 def _median(times: list[tuple[float, float]], column: int) -> float:
