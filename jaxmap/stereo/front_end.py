@@ -28,9 +28,9 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    The images are empty where observations, which hold none, are read again; the right one is grey where OpenCV matches.
+    The images are empty where observations are read again; the right one is grey where OpenCV matches it.
     The disparity is None where the compiled step finds it. `blind` are pixels that have none, whatever the images
-    show: the raw image does not reach there, or something is too near; `bands` say which disparities are searched where.
+    show: the raw image does not reach there, or something is too near; `bands` say what is searched where.
     `too_near` is the share of pixels that were left out because they are nearer than all that is searched, and
     `nearest_px` the disparity of the nearest of them.
     """
