@@ -6,56 +6,24 @@
 // not depend on the number of threads. `jaxmap/models/fused.py` says what is computed, in JAX.
 
 #include <algorithm>
-#include <atomic>
-#include <condition_variable>
 #include <cstdint>
-#include <cstdlib>
 #include <cstring>
 #include <functional>
-#include <memory>
-#include <mutex>
-#include <new>
 
+#include "threads.h"
+#include "vectors.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;
+using namespace jaxmap;
 
 namespace {
 
-// ---- Vectors of the processor, and how many fit into its registers ----
-
-#if defined(__AVX512F__)
-constexpr int kLanes = 16, kWidest = 4;
-#elif defined(__AVX__)
-constexpr int kLanes = 8, kWidest = 2;
-#elif defined(__aarch64__)
-constexpr int kLanes = 4, kWidest = 4;
-#else
-constexpr int kLanes = 4, kWidest = 2;
-#endif
-typedef float Vector __attribute__((vector_size(kLanes * sizeof(float))));
-typedef float Unaligned __attribute__((vector_size(kLanes * sizeof(float)), aligned(4)));
-
-// Pixels whose sums are held in registers beside a panel of so many vectors of outputs.
+// Vectors of outputs whose sums registers hold beside those of several pixels, and how many pixels go with them.
+constexpr int kWidest = kRegisters / 8;
 constexpr int pixels_beside(int vectors) { return vectors == 4 || kWidest == 2 ? 6 : 8; }
 
-inline Vector load(const float* from) { return *reinterpret_cast<const Unaligned*>(from); }
-inline void store(float* to, Vector value) { *reinterpret_cast<Unaligned*>(to) = value; }
-// Taking away zeros changes no number, where adding them turns -0 into 0, and compiles to nothing.
-inline Vector all(float value) { return value - Vector{}; }
 inline int64_t vectors_of(int64_t channels) { return (channels + kLanes - 1) / kLanes; }
-
-inline Vector load_some(const float* from, int64_t count) {
-  if (count >= kLanes) return load(from);
-  Vector value{};
-  std::memcpy(&value, from, count * sizeof(float));
-  return value;
-}
-
-inline void store_some(float* to, Vector value, int64_t count) {
-  if (count >= kLanes) return store(to, value);
-  std::memcpy(to, &value, count * sizeof(float));
-}
 
 // An activation: values are cut off below and above; NaN stays.
 struct Range {
@@ -66,57 +34,6 @@ struct Range {
     return value > highest ? highest : value;
   }
 };
-
-// ---- Memory that a thread keeps from call to call: fresh pages cost more than what is done with them ----
-
-class Scratch {
- public:
-  float* floats(int64_t count) {
-    if (count > size_) {
-      std::free(data_);
-      const size_t bytes = (count * sizeof(float) + 63) / 64 * 64;
-      data_ = static_cast<float*>(std::aligned_alloc(64, bytes));
-      size_ = data_ ? count : 0;
-      if (!data_) throw std::bad_alloc();
-    }
-    return data_;
-  }
-  ~Scratch() { std::free(data_); }
-
- private:
-  float* data_ = nullptr;
-  int64_t size_ = 0;
-};
-
-// ---- Threads ----
-
-// Runs `work(index)` for all indices on XLA's threads and this one, which never waits for a thread that has not begun:
-// all of them may be waiting in the same way.
-void parallel(ffi::ThreadPool& pool, int64_t count, const std::function<void(int64_t)>& work) {
-  struct Shared {
-    std::function<void(int64_t)> work;
-    std::atomic<int64_t> next{0};
-    int64_t count, done = 0;
-    std::mutex mutex;
-    std::condition_variable finished;
-    void run() {
-      int64_t own = 0;
-      for (int64_t index; (index = next.fetch_add(1)) < count; ++own) work(index);
-      if (own == 0) return;
-      std::lock_guard<std::mutex> lock(mutex);
-      done += own;
-      if (done == count) finished.notify_all();
-    }
-  };
-  auto shared = std::make_shared<Shared>();
-  shared->work = work;
-  shared->count = count;
-  const int64_t helpers = std::min<int64_t>(pool.num_threads(), count) - 1;
-  for (int64_t helper = 0; helper < helpers; ++helper) pool.Schedule([shared] { shared->run(); });
-  shared->run();
-  std::unique_lock<std::mutex> lock(shared->mutex);
-  shared->finished.wait(lock, [&] { return shared->done == count; });
-}
 
 // ---- Products of pixels with a matrix ----
 
@@ -375,13 +292,13 @@ constexpr int64_t kTogether = 96;
 
 // Rows `first` to `end` of the result of one image.
 void rows_of_block(const Block& block, const float* image, float* result, int64_t first, int64_t end) {
-  thread_local Scratch kept_hidden, kept_windows;
+  thread_local Scratch<float> kept_hidden, kept_windows;
   const Sizes &size = block.images, &out = block.results;
   const Window& window = block.window;
   const int64_t row_floats = size.width * (block.expand.kernel ? block.expand.outputs : size.channels);
   // The expanded rows that windows see lie in a ring; `made` is the next one to be made.
   const int64_t ring = (window.size - 1) * window.dilation + 1;
-  float* hidden = block.expand.kernel ? kept_hidden.floats(ring * row_floats) : nullptr;
+  float* hidden = block.expand.kernel ? kept_hidden.of(ring * row_floats) : nullptr;
   int64_t made = std::max<int64_t>(0, first * window.stride - window.before_rows);
   auto row_at = [&](int64_t row) -> const float* {
     if (row < 0 || row >= size.height) return nullptr;
@@ -393,7 +310,7 @@ void rows_of_block(const Block& block, const float* image, float* result, int64_
     return hidden + row % ring * row_floats;
   };
   const int64_t group = (kTogether + out.width - 1) / out.width, row_inputs = out.width * block.project.inputs;
-  float* windows = kept_windows.floats(group * row_inputs);
+  float* windows = kept_windows.of(group * row_inputs);
   const float* rows[kLargestWindow];
   for (int64_t begin = first; begin < end; begin += group) {
     const int64_t count = std::min(group, end - begin);
@@ -415,16 +332,16 @@ void rows_of_block(const Block& block, const float* image, float* result, int64_
 }
 
 void run(ffi::ThreadPool& pool, Block block, const float* images, float* results) {
-  thread_local Scratch kept;
+  thread_local Scratch<float> kept;
   Pointwise &expand = block.expand, &project = block.project;
   const int64_t expand_size = expand.kernel ? expand.packed_size() : 0;
-  float* packed = kept.floats(expand_size + project.packed_size());
+  float* packed = kept.of(expand_size + project.packed_size());
   expand.packed = packed;
   project.packed = packed + expand_size;
   for (const Pointwise* layer : {&expand, &project}) {
     if (!layer->kernel) continue;
     constexpr int64_t kInputs = 32;
-    parallel(pool, (layer->inputs + kInputs - 1) / kInputs, [&](int64_t index) {
+    in_parallel(pool, (layer->inputs + kInputs - 1) / kInputs, [&](int64_t index) {
       const int64_t first = index * kInputs;
       layer->pack(first, std::min(first + kInputs, layer->inputs), const_cast<float*>(layer->packed));
     });
@@ -433,7 +350,7 @@ void run(ffi::ThreadPool& pool, Block block, const float* images, float* results
   const int64_t threads = std::max<int64_t>(1, pool.num_threads());
   if (block.window.size == 1 && block.window.stride == 1 && !block.depthwise.kernel) {
     const int64_t pixels = out.batch * out.height * out.width, together = kTogether;
-    parallel(pool, (pixels + together - 1) / together, [&](int64_t index) {
+    in_parallel(pool, (pixels + together - 1) / together, [&](int64_t index) {
       const int64_t first = index * together, count = std::min(together, pixels - first);
       const float* shortcut = block.shortcut ? images + first * size.channels : nullptr;
       multiply(project, images + first * size.channels, count, results + first * out.channels, out.channels, shortcut);
@@ -444,7 +361,7 @@ void run(ffi::ThreadPool& pool, Block block, const float* images, float* results
   const int64_t least = expand.kernel ? 4 * (block.window.size - 1) * block.window.dilation : 4;
   const int64_t most = (out.height + threads - 1) / threads, parts_of = std::min(most, std::max<int64_t>(1, least));
   const int64_t parts = (out.height + parts_of - 1) / parts_of;
-  parallel(pool, out.batch * parts, [&](int64_t index) {
+  in_parallel(pool, out.batch * parts, [&](int64_t index) {
     const int64_t image = index / parts, first = index % parts * parts_of;
     rows_of_block(block, images + image * size.height * size.width * size.channels,
                   results + image * out.height * out.width * out.channels, first,

@@ -1,6 +1,6 @@
 """Compiles the kernels for this processor, once, and makes them known to XLA.
 
-Each compiled library lies in the cache folder (`native`), under a name that holds what it was made of: the source, the
+Each compiled library lies in the cache folder (`native`), under a name that holds what it was made of: the sources, the
 compiler's version, the processor's features and XLA's interface. Without a compiler, or if anything fails, all runs
 as JAX compiles it, with the same results; one line on stderr says so. `JAXMAP_NATIVE=0` turns the kernels off.
 """
@@ -71,7 +71,8 @@ def _compiled(target: str = TARGET) -> Path:
         raise OSError(f"no C++ compiler ({asked or ', '.join(_COMPILERS)}) on PATH")
     # What it defines for this processor names its version and the instructions that it may use.
     macros = _run(compiler, *_FLAGS, "-dM", "-E", "-x", "c++", os.devnull)
-    parts = (source.read_text("utf-8"), macros, " ".join(_FLAGS), version("jaxlib"))
+    texts = (path.read_text("utf-8") for path in (source, *sorted(source.parent.glob("*.h"))))
+    parts = (*texts, macros, " ".join(_FLAGS), version("jaxlib"))
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     library = cache_folder() / "native" / f"{source.stem}-{name}.so"
     if not library.exists():

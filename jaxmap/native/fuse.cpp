@@ -10,7 +10,6 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
-#include <condition_variable>
 #include <cstdint>
 #include <cstring>
 #include <limits>
@@ -18,9 +17,12 @@
 #include <mutex>
 #include <vector>
 
+#include "threads.h"
+#include "vectors.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;
+using namespace jaxmap;
 
 namespace {
 
@@ -42,31 +44,6 @@ struct Numbers {
   float camera_z;
   float hit, miss, full_points;
 };
-
-// Does work(0) to work(count - 1) on this thread and on the threads of XLA that are idle.
-template <typename Work>
-void in_parallel(ffi::ThreadPool& pool, int count, const Work& work) {
-  struct Progress {
-    std::atomic<int> next{0};
-    int done = 0;
-    std::mutex mutex;
-    std::condition_variable all_done;
-  };
-  auto progress = std::make_shared<Progress>();
-  // A task that starts late finds nothing left, and does not look at `work`, which may be gone.
-  auto take_part = [progress, count, &work] {
-    int mine = 0;
-    for (int index; (index = progress->next.fetch_add(1)) < count; ++mine) work(index);
-    if (mine == 0) return;
-    std::lock_guard<std::mutex> lock(progress->mutex);
-    if ((progress->done += mine) == count) progress->all_done.notify_one();
-  };
-  int helpers = std::min<int64_t>({pool.num_threads(), kMostThreads, count}) - 1;
-  for (int helper = 0; helper < helpers; ++helper) pool.Schedule(decltype(take_part)(take_part));
-  take_part();
-  std::unique_lock<std::mutex> lock(progress->mutex);
-  progress->all_done.wait(lock, [&] { return progress->done == count; });
-}
 
 // What a thread has summed up: rows of numbers for the voxels, or columns, that its points fell into.
 template <typename Number>
@@ -91,27 +68,15 @@ struct Sums {
   }
 };
 
-// An array that grows; what it holds is not kept, nor made.
-template <typename Number>
-struct Room {
-  std::unique_ptr<Number[]> numbers;
-  int64_t size = 0;
-
-  Number* of(int64_t wanted) {
-    if (size < wanted) numbers.reset(new Number[size = wanted]);
-    return numbers.get();
-  }
-};
-
 // Memory that is kept from frame to frame; all slots are zero in between.
 struct Workspace {
   std::vector<int32_t> voxel_slots, column_slots;
   std::vector<Sums<float>> voxels;
   std::vector<Sums<double>> columns;
   // Of each run its voxel, weights by class and heights; those of block `b` begin at `b * kBlock`.
-  Room<int32_t> places, runs_of_block;
-  Room<float> weights;
-  Room<double> heights;
+  Scratch<int32_t> places, runs_of_block;
+  Scratch<float> weights;
+  Scratch<double> heights;
 
   static std::unique_ptr<Workspace> take() {
     std::lock_guard<std::mutex> lock(mutex);
@@ -248,12 +213,12 @@ void sum_runs(const Frame& frame, int32_t block, Workspace& work) {
     while (i < count && places[i] == place) ++i;
     if (place == kNowhere) continue;
     const int64_t run = begin + runs++;
-    work.places.numbers[run] = place;
-    weigh(frame, begin + from, begin + i, work.weights.numbers.get() + run * (frame.classes + 1));
+    work.places.get()[run] = place;
+    weigh(frame, begin + from, begin + i, work.weights.get() + run * (frame.classes + 1));
     if (frame.height_weights != nullptr)
-      weigh_heights(frame, begin + from, begin + i, work.heights.numbers.get() + run * 4);
+      weigh_heights(frame, begin + from, begin + i, work.heights.get() + run * 4);
   }
-  work.runs_of_block.numbers[block] = runs;
+  work.runs_of_block.get()[block] = runs;
 }
 
 // Adds up the runs in the voxels from `low` up to `high`.
@@ -261,18 +226,18 @@ void add_runs(const Frame& frame, int32_t blocks, int32_t low, int32_t high, Wor
   const int rows = frame.classes + 1;
   const int32_t depth = int32_t(frame.shape[2]);
   for (int32_t block = 0; block < blocks; ++block) {
-    const int64_t begin = block * kBlock, end = begin + work.runs_of_block.numbers[block];
+    const int64_t begin = block * kBlock, end = begin + work.runs_of_block.get()[block];
     for (int64_t run = begin; run < end; ++run) {
-      const int32_t place = work.places.numbers[run], voxel = place >= 0 ? place : ~place;
+      const int32_t place = work.places.get()[run], voxel = place >= 0 ? place : ~place;
       if (voxel < low || voxel >= high) continue;
       if (place >= 0) {
         float* row = work.voxels[share].row(work.voxel_slots.data(), voxel, rows);
-        for (int r = 0; r < rows; ++r) row[r] += work.weights.numbers[run * rows + r];
+        for (int r = 0; r < rows; ++r) row[r] += work.weights.get()[run * rows + r];
       }
       if (frame.height_weights != nullptr) {
         double* row = work.columns[share].row(
             work.column_slots.data(), voxel / depth * frame.window_layers() + frame.layer_of(voxel % depth), 4);
-        for (int r = 0; r < 4; ++r) row[r] += work.heights.numbers[run * 4 + r];
+        for (int r = 0; r < 4; ++r) row[r] += work.heights.get()[run * 4 + r];
       }
     }
   }
@@ -438,10 +403,10 @@ std::vector<int64_t> share_planes(const Frame& frame, int32_t blocks, const Work
   std::vector<int64_t> runs(planes, 0), ends;
   int64_t total = 0, sum = 0;
   for (int32_t block = 0; block < blocks; ++block) {
-    const int64_t begin = block * kBlock, end = begin + work.runs_of_block.numbers[block];
+    const int64_t begin = block * kBlock, end = begin + work.runs_of_block.get()[block];
     // One in eight shows well enough where they are.
     for (int64_t run = begin; run < end; run += 8, ++total) {
-      const int32_t place = work.places.numbers[run];
+      const int32_t place = work.places.get()[run];
       ++runs[(place >= 0 ? place : ~place) / of_plane];
     }
   }
