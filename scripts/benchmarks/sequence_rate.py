@@ -104,6 +104,7 @@ class Run:
 
         self.plan, self.folder, self.voxel_map = plan, folder, plan.mapper.init()
         self.mapper, self.cost = compile_step(plan.mapper, self.voxel_map, plan.frame_form, plan.params, plan.key)
+        self.showing = plan.mapper.step
         self.prepared = list(plan.prepare())
         self.grey = [[as_grey(image) for image in one.rectified[:2]] for one in self.prepared]
         self.sgbm = _sgbm(plan.front_end.matcher.options, *self.grey[0][0].shape)
@@ -178,8 +179,10 @@ class Run:
             log.add(FusedFrame(prepared, info))
         labels = None
         if plan.labeller.classes:
-            with spent.stage("labels of a key frame"):
-                labels = np.asarray(plan.mapper.label_image(frame, plan.params, plan.key, 1))
+            frame = replace(frame, show=to_device(True, np.bool_))
+            with spent.stage("step of a key frame"):
+                self.voxel_map, info = self.showing(self.voxel_map, frame, plan.params, plan.key)
+                labels = np.asarray(info.labels)
         folder = RunFolder(self.folder / "run")
         folder.pictures.mkdir(parents=True, exist_ok=True)
         with spent.stage("picture of a key frame"):
