@@ -14,10 +14,10 @@ import numpy as np
 from jaxmap.stereo.coarse import Coarse
 from jaxmap.stereo.match import OVERLAP_ROWS, Band, Matcher
 
-STEP_ROWS = 48
+STEP_ROWS = 32
 """Bands begin and end at multiples of about this."""
-MARGIN_PX = 2
-"""What small images may be off, in their pixels, with what is smaller than their pixels."""
+MARGIN_PX = 1
+"""What small images may be off, in their pixels."""
 LEAST_KNOWN = 0.5
 """Where small images match less than this share of the pixels, they do not tell what there is."""
 
@@ -57,8 +57,8 @@ def _bounds(coarse: Coarse, matcher: Matcher, first: int, end: int) -> tuple[flo
     """The least disparity of some rows, and the first beyond the greatest; all of the matcher's where it is unknown."""
     rows = slice(max(first - OVERLAP_ROWS, 0) // coarse.shrink, -(-(end + OVERLAP_ROWS) // coarse.shrink))
     there = coarse.disparity_px[rows]
-    known = there[np.isfinite(there)]
-    if known.size < LEAST_KNOWN * there.size or not known.size:
+    known = there[coarse.telling[rows]]
+    if np.isfinite(there).mean() < LEAST_KNOWN or not known.size:
         return -np.inf, np.inf
     margin_px = MARGIN_PX * coarse.shrink
     return float(known.min()) - margin_px, float(known.max()) + margin_px + 1

@@ -40,7 +40,7 @@ def test_bands_are_the_image_and_hold_what_was_seen(seed, least_px, count, heigh
     shrink = int(rng.integers(2, 5))
     levels_px = rng.uniform(least_px, least_px + count, size=(max(height_px // shrink, 1), 1))
     disparity_px = np.where(rng.random((len(levels_px), 20)) < rng.uniform(0.2, 1), levels_px, np.nan)
-    bands = search_bands(Coarse(disparity_px, shrink), matcher, height_px)
+    bands = search_bands(Coarse(disparity_px, np.isfinite(disparity_px), shrink), matcher, height_px)
     assert [band.first for band in bands] == [0, *(band.end for band in bands[:-1])]
     assert bands[-1].end == height_px
     for band in bands:
@@ -76,7 +76,8 @@ def test_the_same_is_found_with_a_fraction_of_the_disparities():
 
 def test_where_small_images_show_nothing_everything_is_searched():
     matcher = Matcher(StereoOptions(num_disparities=DISPARITIES), WIDTH_PX)
-    unknown = Coarse(np.full((HEIGHT_PX // 2, WIDTH_PX // 2), np.nan), 2)
+    nothing = np.full((HEIGHT_PX // 2, WIDTH_PX // 2), np.nan)
+    unknown = Coarse(nothing, np.isfinite(nothing), 2)
     assert search_bands(unknown, matcher, HEIGHT_PX) == (matcher.band(0, HEIGHT_PX),)
     left, right, _ = slope_pair()
     np.testing.assert_array_equal(matcher(left, right, [matcher.band(0, HEIGHT_PX)]), matcher(left, right))
