@@ -17,8 +17,9 @@ from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import add_evidence, count_points
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.fusion.sensor_model import frame_evidence, total_weight
-from jaxmap.fusion.surface import add_heights, gather_heights
+from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
+from jaxmap.fusion.surface import add_heights, gather_heights, height_sigma
+from jaxmap.geometry.cloud import project
 from jaxmap.types import GridSpec, PointLabels, StereoCamera, VoxelMap
 
 
@@ -28,22 +29,14 @@ class Sighting(NamedTuple):
     Attributes:
         camera: the rectified camera.
         T_world_camera: its pose.
-        points_world: metres, one for each pixel.
-        labels: of the points, and which of them count.
-        weights: how much each point counts.
-        height_sigma_m: standard deviation of the height of each point, where heights are kept.
-        depth_m: along the optical axis.
-        valid: pixels that have a depth.
+        disparity_px: NaN where unknown.
+        labels: of the points of the pixels, and which of them count.
     """
 
     camera: StereoCamera
     T_world_camera: jaxlie.SE3
-    points_world: Float[Array, "N 3"]
+    disparity_px: Float[Array, "H W"]
     labels: PointLabels
-    weights: Float[Array, "N"]
-    height_sigma_m: Float[Array, "N"] | None
-    depth_m: Float[Array, "H W"]
-    valid: Bool[Array, "H W"]
 
 
 class Counted(NamedTuple):
@@ -76,18 +69,18 @@ def evidence_of(
         grid: that of the map.
         window: of it.
         params: the sensor model, whose matrix gives the number of classes.
-        rule: how the points of a frame add up, and whether it carves.
+        rule: how the points of a frame add up, whether it carves, and whether heights are kept.
         depth_range_m: voxels nearer or farther are not seen through.
     """
-    points_world, labels = sighting.points_world, sighting.labels
-    free = None
-    if rule.carve:
-        pose, depth_m = sighting.T_world_camera, sighting.depth_m
-        free = carve(sighting.camera, pose, depth_m, sighting.valid, window, params, depth_range_m)
-    counts = count_points(window, points_world, labels, sighting.weights, params.class_increments.shape[0])
+    camera, pose, disparity_px, labels = sighting
+    cloud = project(camera, pose, disparity_px, depth_range_m, params.disparity_sigma_px)
+    free = carve(camera, pose, cloud.depth_m, cloud.valid, window, params, depth_range_m) if rule.carve else None
+    weights = point_weights(grid, cloud, rule)
+    counts = count_points(window, cloud.points_world, labels, weights, params.class_increments.shape[0])
     heights = None
-    if sighting.height_sigma_m is not None:
-        heights = gather_heights(grid, window, points_world, sighting.height_sigma_m, labels.keep)
+    if rule.surface:
+        sigma_m = height_sigma(cloud, pose.translation()[2])
+        heights = gather_heights(grid, window, cloud.points_world, sigma_m, labels.keep)
     counted = _count_voxels(total_weight(counts) > 0, free)
     return Evidence(frame_evidence(counts, free, params, rule), heights, counted)
 

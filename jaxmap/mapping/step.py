@@ -21,8 +21,6 @@ from jaxmap.fusion.frame import Counted, Sighting
 from jaxmap.fusion.kernel import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.fusion.sensor_model import point_weights
-from jaxmap.fusion.surface import height_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
@@ -115,6 +113,7 @@ class SeenFrame(NamedTuple):
     sighting: Sighting
     window: GridSpec
     frame: Frame
+    valid: Int[Array, ""]
     in_range: Int[Array, ""]
     estimate: PyTree
     shown: UInt8[Array, "H W"] | None
@@ -153,16 +152,14 @@ def see_frame(
     shown = None if frame.show is None else _shown(frame.show, labels, cloud.valid.shape)
     labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
-    weights = point_weights(grid, cloud, rule)
-    height_sigma_m = height_sigma(cloud, pose.translation()[2]) if rule.surface else None
-    sighting = Sighting(camera, pose, cloud.points_world, labels, weights, height_sigma_m, cloud.depth_m, cloud.valid)
-    return SeenFrame(sighting, window, frame, cloud.in_range.sum(), estimate, shown)
+    sighting = Sighting(camera, pose, frame.matched_px, labels)
+    return SeenFrame(sighting, window, frame, cloud.valid.sum(), cloud.in_range.sum(), estimate, shown)
 
 
 def report_of(seen: SeenFrame, counted: Counted) -> StepReport:
     """What the step says of a frame."""
     return StepReport(
-        points_valid=seen.sighting.valid.sum(),
+        points_valid=seen.valid,
         points_in_range=seen.in_range,
         points_kept=seen.sighting.labels.keep.sum(),
         voxels_hit=counted.hits,

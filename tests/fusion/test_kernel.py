@@ -41,20 +41,17 @@ by_kernel = jax.jit(add_sighting, static_argnums=(4, 5))
 needs_kernel = pytest.mark.skipif(not has_kernel(FUSE_TARGET), reason="there is no compiler, or no CPU")
 
 
-def sighting_of(pose: jaxlie.SE3, rng: np.random.Generator, *, soft: bool, heights: bool, classes: int = 3) -> Sighting:
+def sighting_of(pose: jaxlie.SE3, rng: np.random.Generator, *, soft: bool, classes: int = 3) -> Sighting:
     """Smooth ground and steps in it, with holes, seen from a pose."""
     row, column = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
     depth_m = 1.0 + 3.0 * np.sin(row / 20 + rng.uniform(0, 6)) ** 2 + (column // rng.integers(5, 30)) % 2
     depth_m += rng.normal(0, 0.01, depth_m.shape)
     disparity_px = np.where(rng.random(depth_m.shape) < 0.9, 12.0 / depth_m, np.nan).astype(np.float32)
-    cloud = project(CAMERA, pose, jnp.asarray(disparity_px), DEPTHS_M, 0.5)
-    points, keep = depth_m.size, cloud.in_range.reshape(-1)
+    points, keep = depth_m.size, project(CAMERA, pose, jnp.asarray(disparity_px), DEPTHS_M, 0.5).in_range.reshape(-1)
     shares = rng.dirichlet(np.ones(classes + 1), points)[:, :classes].astype(np.float32)
     hard = rng.choice(np.array([*range(classes), IGNORE]), points).astype(np.int32)
     labels = PointLabels(keep, probabilities=shares) if soft else PointLabels(keep, labels=hard)
-    weights = rng.uniform(0.1, 1.0, points).astype(np.float32)
-    sigma_m = depth_sigma(CAMERA, cloud.depth_m, 0.5).reshape(-1) if heights else None
-    return Sighting(CAMERA, pose, cloud.points_world, labels, weights, sigma_m, cloud.depth_m, cloud.valid)
+    return Sighting(CAMERA, pose, disparity_px, labels)
 
 
 def maps_equal(one: VoxelMap, other: VoxelMap, *, most_freed: int = 2) -> None:
@@ -73,14 +70,14 @@ def maps_equal(one: VoxelMap, other: VoxelMap, *, most_freed: int = 2) -> None:
 @settings(max_examples=10)
 @given(poses(reach_m=1.0), rngs())
 def test_the_kernel_equals_the_plain_form(pose, rng):
-    compare(sighting_of(pose, rng, soft=True, heights=True), MEAN)
+    compare(sighting_of(pose, rng, soft=True), MEAN)
 
 
 @needs_kernel
 @pytest.mark.slow
 @given(poses(reach_m=1.0), rngs(), st.sampled_from(RULES), st.booleans())
 def test_the_kernel_equals_the_plain_form_under_every_rule(pose, rng, rule, soft):
-    compare(sighting_of(pose, rng, soft=soft and not rule.hard_labels, heights=True), rule)
+    compare(sighting_of(pose, rng, soft=soft and not rule.hard_labels), rule)
 
 
 def compare(sighting: Sighting, rule: FusionRule) -> None:
@@ -101,7 +98,7 @@ def compare(sighting: Sighting, rule: FusionRule) -> None:
 @pytest.mark.parametrize("soft", [False, True])
 def test_the_kernel_takes_any_number_of_classes(classes, soft):
     rng, pose = np.random.default_rng(3), jaxlie.SE3.identity()
-    sighting = sighting_of(pose, rng, soft=soft, heights=False, classes=len(classes))
+    sighting = sighting_of(pose, rng, soft=soft, classes=len(classes))
     arguments = (make_voxel_map(GRID, classes), sighting, GRID, make_fusion_params(classes), MEAN, DEPTHS_M)
     maps_equal(plainly(*arguments)[0], by_kernel(*arguments)[0])
 
@@ -110,7 +107,7 @@ def test_the_kernel_takes_any_number_of_classes(classes, soft):
 @settings(max_examples=10)
 @given(poses(reach_m=1.0), rngs(), st.booleans())
 def test_through_any_window_the_kernel_adds_the_same_bits(pose, rng, soft):
-    sighting = sighting_of(pose, rng, soft=soft, heights=True)
+    sighting = sighting_of(pose, rng, soft=soft)
     params, empty = make_fusion_params(CLASSES), make_voxel_map(GRID, CLASSES, surface=True)
     whole, _ = by_kernel(empty, sighting, GRID, params, MEAN, DEPTHS_M)
     first = tuple(int(rng.integers(0, 8)) for _ in range(3))
@@ -133,7 +130,7 @@ def test_through_any_window_the_kernel_adds_the_same_bits(pose, rng, soft):
 @pytest.mark.slow
 def test_points_that_are_no_place_or_weigh_nothing_finite_change_no_bit_of_the_evidence():
     rng, pose = np.random.default_rng(4), jaxlie.SE3.identity()
-    sighting = sighting_of(pose, rng, soft=True, heights=False)
+    sighting = sighting_of(pose, rng, soft=True)
     params, empty = make_fusion_params(CLASSES), make_voxel_map(GRID, CLASSES)
     bad = rng.random(len(sighting.weights)) < 0.5
     # Runs of pixels end at what is left out, however it is left out.
@@ -155,7 +152,7 @@ def test_points_that_are_no_place_or_weigh_nothing_finite_change_no_bit_of_the_e
 @needs_kernel
 @pytest.mark.slow
 def test_gradients_are_those_of_the_plain_form():
-    sighting = sighting_of(jaxlie.SE3.identity(), np.random.default_rng(5), soft=True, heights=True)
+    sighting = sighting_of(jaxlie.SE3.identity(), np.random.default_rng(5), soft=True)
     empty, weighing = make_voxel_map(GRID, CLASSES, surface=True), jnp.sin(jnp.arange(4.0))[:, None, None, None]
 
     def score(add, params, points_world):
@@ -174,7 +171,7 @@ def test_gradients_are_those_of_the_plain_form():
 @pytest.mark.slow
 def test_several_maps_at_once_are_each_their_own():
     rng = np.random.default_rng(6)
-    sighting = sighting_of(jaxlie.SE3.identity(), rng, soft=True, heights=False)
+    sighting = sighting_of(jaxlie.SE3.identity(), rng, soft=True)
     params, empty = make_fusion_params(CLASSES), make_voxel_map(GRID, CLASSES)
     factors = jnp.array([1.0, 0.5])
 
@@ -193,7 +190,7 @@ def fused_hash() -> str:
     voxel_map = make_voxel_map(GRID, CLASSES, surface=True)
     for turn in range(3):
         pose = jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(0.3 * turn))
-        sighting = sighting_of(pose, rng, soft=True, heights=True)
+        sighting = sighting_of(pose, rng, soft=True)
         voxel_map, _ = by_kernel(voxel_map, sighting, GRID, params, MEAN, DEPTHS_M)
     tensors = (np.asarray(voxel_map.log_odds), np.asarray(voxel_map.surface))
     return hashlib.sha256(b"".join(tensor.tobytes() for tensor in tensors)).hexdigest()
@@ -213,7 +210,7 @@ def test_on_one_core_the_map_has_the_same_bits():
 
 def test_without_a_compiler_the_plain_form_is_taken(monkeypatch):
     monkeypatch.setenv("JAXMAP_NATIVE", "0")
-    sighting = sighting_of(jaxlie.SE3.identity(), np.random.default_rng(8), soft=True, heights=False)
+    sighting = sighting_of(jaxlie.SE3.identity(), np.random.default_rng(8), soft=True)
     arguments = (make_voxel_map(GRID, CLASSES), sighting, GRID, make_fusion_params(CLASSES))
     text = jax.jit(lambda *given: add_sighting(*given, MEAN, DEPTHS_M)).lower(*arguments).as_text()
     assert FUSE_TARGET not in text
