@@ -23,10 +23,10 @@ import jax
 
 from jaxmap.host.cache import cache_folder
 
-TARGET, FUSE_TARGET = "jaxmap_block", "jaxmap_fuse"
-"""The kernels' names in compiled programs: blocks of convolutions, and a frame into the map."""
+TARGET, FUSE_TARGET, LABELS_TARGET = "jaxmap_block", "jaxmap_fuse", "jaxmap_labels"
+"""The kernels' names in compiled programs: blocks of convolutions, a frame into the map, and logits to labels."""
 
-_SOURCES = {TARGET: "blocks.cpp", FUSE_TARGET: "fuse.cpp"}
+_SOURCES = {TARGET: "blocks.cpp", FUSE_TARGET: "fuse.cpp", LABELS_TARGET: "labels.cpp"}
 _COMPILERS = ("c++", "g++", "clang++")
 # Products and sums may be fused; nothing else may change what is computed.
 _FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-std=c++17", "-shared", "-fPIC", "-w")

@@ -20,7 +20,6 @@ from jaxmap.fusion.frame import Sighting, add_plainly
 from jaxmap.fusion.kernel import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
-from jaxmap.geometry.camera import depth_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.labels import IGNORE
 from jaxmap.native.build import FUSE_TARGET, has_kernel
