@@ -1,13 +1,14 @@
 """Which disparities occur in which rows of a pair, so that no others are searched.
 
 A rover's camera looks along the ground: each part of the image holds a fraction of all disparities, and what is not
-searched is no false match either. Small images say which (`stereo.coarse`), as in matching from coarse to fine, but for
-rows in a band: the full images are matched as ever within these bounds.
+searched is no false match either. Small images say which (`stereo.coarse`): from the least that they show in a band of
+rows to the greatest that they show there or anywhere below. What stands on the ground has its disparity, and may be too
+thin for small images. Within these bounds the full images are matched as ever.
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -38,27 +39,28 @@ def search_bands(coarse: Coarse, matcher: Matcher, height_px: int) -> tuple[Band
         height_px: of the full images.
     """
     edges = np.linspace(0, height_px, max(round(height_px / STEP_ROWS), 1) + 1).astype(int).tolist()
-    bounds = [_bounds(coarse, matcher, first, end) for first, end in pairwise(edges)]
+    bounds = [_bounds(coarse, first, end) for first, end in pairwise(edges)]
+    limits_px = [*accumulate((limit_px for _, limit_px in reversed(bounds)), max)][::-1]
     # For each edge: what the rows above it cost at least, and the bands that do so.
     best: list[tuple[float, tuple[Band, ...]]] = [(0.0, ())]
     for last, end in enumerate(edges[1:]):
         ways = []
-        least_px, limit_px = bounds[last]
+        least_px = np.inf
         for start in range(last, -1, -1):
-            least_px, limit_px = min(least_px, bounds[start][0]), max(limit_px, bounds[start][1])
-            band = matcher.band(edges[start], end, least_px, limit_px)
+            least_px = min(least_px, bounds[start][0])
+            band = matcher.band(edges[start], end, least_px, limits_px[start])
             cost, above = best[start]
             ways.append((cost + (end - edges[start] + _FIXED_ROWS) * (_FIXED_COST + band.disparities), (*above, band)))
         best.append(min(ways))
     return best[-1][1]
 
 
-def _bounds(coarse: Coarse, matcher: Matcher, first: int, end: int) -> tuple[float, float]:
-    """The least disparity of some rows, and the first beyond the greatest; all of the matcher's where it is unknown."""
+def _bounds(coarse: Coarse, first: int, end: int) -> tuple[float, float]:
+    """The least disparity of some rows, and the first beyond the greatest; endless where they are unknown."""
     rows = slice(max(first - OVERLAP_ROWS, 0) // coarse.shrink, -(-(end + OVERLAP_ROWS) // coarse.shrink))
     there = coarse.disparity_px[rows]
-    known = there[coarse.telling[rows]]
-    if np.isfinite(there).mean() < LEAST_KNOWN or not known.size:
+    known = there[np.isfinite(there)]
+    if known.size < LEAST_KNOWN * there.size or not known.size:
         return -np.inf, np.inf
     margin_px = MARGIN_PX * coarse.shrink
     return float(known.min()) - margin_px, float(known.max()) + margin_px + 1

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxmap.stereo.align import shrunk_grey
 from jaxmap.stereo.jax_matcher import JaxMatcher
-from jaxmap.stereo.match import Matcher, StereoOptions, as_grey
+from jaxmap.stereo.match import Matcher, StereoOptions
 
 WIDTH_PX = 256
 RANGES = 3
@@ -19,22 +18,11 @@ RANGES = 3
 
 MOST_OF_WIDTH = 0.8
 
-FLAT, SMALL = 2.0, 0.05
-"""Blobs that are nowhere steeper, in grey levels a pixel along rows, and at most this share of the image, tell nothing:
-they are false matches in the sky. What stands before something else has edges."""
-
-_SOBEL, _UNKNOWN = 8, -(2**15)
-"""What the Sobel filter makes of a grey level a pixel; and an unknown disparity."""
-
 
 class Coarse(NamedTuple):
-    """Disparities in px of the full images, NaN where unknown, for pixels that are `shrink` times as wide.
-
-    `telling` are known pixels but those that, without texture, are likely false.
-    """
+    """Disparities in px of the full images, NaN where unknown, for pixels that are `shrink` times as wide."""
 
     disparity_px: Float[np.ndarray, "h w"]
-    telling: Bool[np.ndarray, "h w"]
     shrink: int
 
 
@@ -67,15 +55,5 @@ class CoarseMatcher:
             left: uint8, (H, W) or (H, W, 3) RGB.
             right: likewise.
         """
-        left, right, shrink = as_grey(left), as_grey(right), self._shrink
-        disparity_px = self._matcher(shrunk_grey(left, shrink), shrunk_grey(right, shrink))
-        steep = shrunk_grey(np.abs(cv2.Sobel(left, cv2.CV_16S, 1, 0)), shrink) > _SOBEL * FLAT
-        telling = np.isfinite(disparity_px) & (steep | self._in_large_blobs(disparity_px))
-        return Coarse(shrink * disparity_px, telling, shrink)
-
-    def _in_large_blobs(self, disparity_px: np.ndarray) -> np.ndarray:
-        """Pixels of blobs that are large for small images."""
-        sixteenths = np.nan_to_num(16 * disparity_px, nan=_UNKNOWN).astype(np.int16)
-        most, step = int(SMALL * sixteenths.size), 16 * self._matcher.options.speckle_range_px
-        cv2.filterSpeckles(sixteenths, _UNKNOWN, most, step)
-        return sixteenths != _UNKNOWN
+        shrink = self._shrink
+        return Coarse(shrink * self._matcher(shrunk_grey(left, shrink), shrunk_grey(right, shrink)), shrink)

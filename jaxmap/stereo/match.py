@@ -216,8 +216,8 @@ class Matcher:
 
         above = min(OVERLAP_ROWS, band.first)
         rows = slice(band.first - above, band.end + self.options.block_size // 2 + 1)
-        # What would match left of the right image is left out; OpenCV leaves out what might.
-        pad = max(band.disparities + min(band.least_px, 0), 0) if self.options.pad_left else 0
+        # OpenCV leaves out the columns whose match may lie left of the right image.
+        pad = max(band.disparities + band.least_px, 0) if self.options.pad_left else 0
         padded = (cv2.copyMakeBorder(image[rows], 0, 0, pad, 0, cv2.BORDER_REPLICATE) for image in (left, right))
         found = self.engine(band).compute(*padded)[above : above + band.end - band.first, pad:]
         # OpenCV's own mark of the unknown is less than all that is searched.

@@ -34,7 +34,7 @@ def too_near(coarse: Coarse, limit_px: int, image_px: Sequence[int]) -> TooNear 
     Returns:
         Pixels and disparity; None where nothing is too near.
     """
-    disparity_px, shrink = coarse.disparity_px, coarse.shrink
+    disparity_px, shrink = coarse
     # A surface as near as the limit is found by the matcher itself.
     near = disparity_px > limit_px + shrink
     if not near.any():
