@@ -74,6 +74,7 @@ def evidence_of(
     """
     camera, pose, disparity_px, labels = sighting
     cloud = project(camera, pose, disparity_px, depth_range_m, params.disparity_sigma_px)
+    labels = labels._replace(keep=labels.keep & cloud.valid.reshape(-1))
     free = carve(camera, pose, cloud.depth_m, cloud.valid, window, params, depth_range_m) if rule.carve else None
     weights = point_weights(grid, cloud, rule)
     counts = count_points(window, cloud.points_world, labels, weights, params.class_increments.shape[0])

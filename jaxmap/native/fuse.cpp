@@ -50,10 +50,10 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
     if (frame.surface != nullptr) add_heights(frame, work->columns[share]);
   });
   if (frame.carve) {
-    const int64_t depth = frame.shape[2], of_plane = frame.shape[1] * depth;
-    float *y_of = work->plane_y.of(of_plane), *z_of = work->plane_z.of(of_plane);
-    for (int64_t j = 0; j < of_plane; ++j) y_of[j] = frame.centre(1, j / depth), z_of[j] = frame.centre(2, j % depth);
-    in_parallel(pool, frame.shape[0], [&](int64_t plane) { freed += carve_plane(frame, plane, y_of, z_of, *work); });
+    const View view(frame);
+    float* along = work->along.of(frame.shape[1]);
+    for (int64_t y = 0; y < frame.shape[1]; ++y) along[y] = frame.centre(1, y);
+    in_parallel(pool, frame.shape[0], [&](int64_t plane) { freed += carve_plane(frame, view, plane, *work); });
   }
   for (int64_t share = 0; share < threads; ++share) {
     work->voxels[share].clear(work->voxel_slots.data());
