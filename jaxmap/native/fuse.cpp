@@ -9,6 +9,7 @@
 #include <atomic>
 #include <cstdint>
 #include <cstring>
+#include <iterator>
 #include <limits>
 
 #include "fuse_carve.h"
@@ -42,8 +43,11 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
   float* across = work->across.of(frame.width);
   for (int64_t column = 0; column < frame.width; ++column) across[column] = (float(column) - n.cx) * (1.0f / n.fx);
 
-  in_parallel(pool, tiles, [&](int64_t tile) { sum_tile(frame, tile, *work); });
-  std::atomic<int32_t> hits{0}, freed{0};
+  std::atomic<int32_t> hits{0}, freed{0}, valid{0}, in_range{0}, kept{0};
+  in_parallel(pool, tiles, [&](int64_t tile) {
+    const PixelCounts counts = sum_tile(frame, tile, *work);
+    valid += counts.valid, in_range += counts.in_range, kept += counts.kept;
+  });
   in_parallel(pool, threads, [&](int64_t share) {
     gather_tiles(frame, tiles, share, threads, *work);
     hits += add_hits(frame, *work, work->voxels[share]);
@@ -59,7 +63,8 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
     work->voxels[share].clear(work->voxel_slots.data());
     work->columns[share].clear(work->column_slots.data());
   }
-  counted[0] = hits, counted[1] = freed;
+  const int32_t numbers[] = {hits, freed, valid, in_range, kept};
+  std::copy(std::begin(numbers), std::end(numbers), counted);  // `fusion.frame.Counted`
   Workspace::give_back(std::move(work));
 }
 

@@ -22,7 +22,14 @@ constexpr int kTileRows = 8, kTileColumns = 256, kTilePixels = kTileRows * kTile
 constexpr int kStride = kTileColumns + 8;  // from row to row of values: reading past the end of one ends in the next
 constexpr int kReachBlock = kTileRows;  // pixels to the edge of a block of `block_reach`; columns divide into them
 constexpr int32_t kNowhere = std::numeric_limits<int32_t>::min();  // the voxel of a point that does not count
-constexpr float kLeastDisparity = 1e-6f;
+
+// As `geometry.camera.disparity_to_depth` decides it; false of NaN.
+inline bool has_depth(float shifted) { return (shifted > 1e-6f) & (shifted < INFINITY); }
+
+// Pixels that have a depth, that lie between the depths which are mapped, and whose points count.
+struct PixelCounts {
+  int32_t valid = 0, in_range = 0, kept = 0;
+};
 
 // The points of neighbouring pixels in a row.
 struct Strip {
@@ -55,7 +62,7 @@ inline float sum_of(const Lanes* lanes) {
 }
 
 // Projects the pixels, and finds the voxels that their points lie in (`geometry.cloud.project`, `flat_voxel_index`).
-// Returns whether any point counts.
+// Returns whether any point counts in the window.
 inline bool locate(const Frame& frame, const float* across, int64_t row, int64_t column, int count, Strip& strip) {
   const Numbers n = frame.numbers;
   const float *R = n.world_of_camera.rotation, *t = n.world_of_camera.translation;
@@ -71,7 +78,7 @@ inline bool locate(const Frame& frame, const float* across, int64_t row, int64_t
   int32_t any = 0;
   for (int i = 0; i < count; ++i) {
     const float shifted = disparity[i] + n.doffs;
-    const bool valid = (shifted > kLeastDisparity) & (shifted < INFINITY);
+    const bool valid = has_depth(shifted);
     const float ratio = n.depth_px / (valid ? shifted : 1.0f), depth = valid ? ratio : 1.0f;
     const float x_camera = across[i] * depth, y_camera = down * depth;
     const float x_world = R[0] * x_camera + R[1] * y_camera + R[2] * depth + t[0];
@@ -95,14 +102,29 @@ inline bool locate(const Frame& frame, const float* across, int64_t row, int64_t
   return any != 0;
 }
 
+// Loops of their own, here and below: compilers vectorise each, but not all of them together.
+inline void count_pixels(const Frame& frame, int64_t pixel, int count, const float* depths, PixelCounts& counts) {
+  const Numbers n = frame.numbers;
+  const float* disparity = frame.disparity + pixel;
+  const uint8_t* keep = frame.keep + pixel;
+  int32_t valid = 0, in_range = 0, kept = 0;
+  for (int i = 0; i < count; ++i) {
+    const int32_t known = has_depth(disparity[i] + n.doffs) ? 1 : 0;
+    valid += known;
+    in_range += (depths[i] >= n.nearest) & (depths[i] <= n.farthest) ? known : 0;
+    kept += keep[i] != 0 ? known : 0;
+  }
+  counts.valid += valid, counts.in_range += in_range, counts.kept += kept;
+}
+
 // Up to where the camera saw through each pixel, and the farthest of those seen so far in each column.
-inline void look_through(const Frame& frame, const float* disparity, int count, const float* depths, float* reach,
+inline void look_through(const Frame& frame, int64_t pixel, int count, const float* depths, float* reach,
                          float* farthest) {
   const Numbers n = frame.numbers;
+  const float* disparity = frame.disparity + pixel;
   for (int i = 0; i < count; ++i) {
-    const float shifted = disparity[i] + n.doffs, depth = depths[i];
-    const bool valid = (shifted > kLeastDisparity) & (shifted < INFINITY);
-    const float seen = valid ? depth - (n.margin + depth * depth * n.sigmas) : 0.0f;
+    const float depth = depths[i], before = depth - (n.margin + depth * depth * n.sigmas);
+    const float seen = has_depth(disparity[i] + n.doffs) ? before : 0.0f;
     reach[i] = seen;
     farthest[i] = std::max(farthest[i], seen);
   }
@@ -214,20 +236,21 @@ inline void add_runs(const Frame& frame, int64_t pixel, int count, const Strip& 
   }
 }
 
-// Sums up the points of a tile by voxels.
-inline void sum_tile(const Frame& frame, int64_t tile, Workspace& work) {
+// Sums up the points of a tile by voxels; returns how many there are.
+inline PixelCounts sum_tile(const Frame& frame, int64_t tile, Workspace& work) {
   thread_local TileSums sums;
   thread_local Strip strip;
   thread_local Scratch<float> kept;
   float *values = kept.of((frame.value_rows() + 1) * kStride), farthest[kTileColumns] = {};
+  PixelCounts counts;
   const int64_t tiles_across = (frame.width + kTileColumns - 1) / kTileColumns;
   const int64_t column = tile % tiles_across * kTileColumns, top = tile / tiles_across * kTileRows;
   const int count = int(std::min<int64_t>(kTileColumns, frame.width - column));
   for (int64_t row = top; row < std::min(frame.height, top + kTileRows); ++row) {
     const int64_t pixel = row * frame.width + column;
     const bool any = locate(frame, work.across.get(), row, column, count, strip);
-    if (frame.carve)
-      look_through(frame, frame.disparity + pixel, count, strip.depths, work.reach.get() + pixel, farthest);
+    count_pixels(frame, pixel, count, strip.depths, counts);
+    if (frame.carve) look_through(frame, pixel, count, strip.depths, work.reach.get() + pixel, farthest);
     if (!any) continue;
     find_runs(strip.voxels, frame.labels != nullptr ? frame.labels + pixel : nullptr, count, strip.starts);
     weigh(frame, pixel, count, strip.depths, values);
@@ -242,6 +265,7 @@ inline void sum_tile(const Frame& frame, int64_t tile, Workspace& work) {
   }
   const int64_t place = tile * kTilePixels, rows = frame.rows();
   work.seen_of_tile.get()[tile] = sums.move_to(work.seen.get() + place, work.sums.get() + place * rows, int(rows));
+  return counts;
 }
 
 }  // namespace jaxmap
