@@ -37,7 +37,7 @@ def add_sighting(
     rule: FusionRule,
     depth_range_m: tuple[float, float],
 ) -> tuple[VoxelMap, Counted]:
-    """Adds a frame to a map; also tells how many voxels it touched.
+    """Adds a frame to a map; also counts its points and the voxels it touched.
 
     Args:
         voxel_map: the map so far.
@@ -102,7 +102,7 @@ def _by_kernel(
         (
             jax.ShapeDtypeStruct(log_odds.shape, log_odds.dtype),
             jax.ShapeDtypeStruct(surface.shape, surface.dtype),
-            jax.ShapeDtypeStruct((2,), jnp.int32),
+            jax.ShapeDtypeStruct((len(Counted._fields),), jnp.int32),
         ),
         input_output_aliases={0: 0, 1: 1},
         vmap_method="sequential",
@@ -122,7 +122,7 @@ def _by_kernel(
         surface=new_surface if surface.size else voxel_map.surface,
         frames_fused=voxel_map.frames_fused + 1,
     )
-    return fused, Counted(counted[0], counted[1])
+    return fused, Counted(*counted)
 
 
 def _numbers(

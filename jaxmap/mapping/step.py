@@ -113,8 +113,6 @@ class SeenFrame(NamedTuple):
     sighting: Sighting
     window: GridSpec
     frame: Frame
-    valid: Int[Array, ""]
-    in_range: Int[Array, ""]
     estimate: PyTree
     shown: UInt8[Array, "H W"] | None
 
@@ -153,15 +151,15 @@ def see_frame(
     labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
     sighting = Sighting(camera, pose, frame.matched_px, labels)
-    return SeenFrame(sighting, window, frame, cloud.valid.sum(), cloud.in_range.sum(), estimate, shown)
+    return SeenFrame(sighting, window, frame, estimate, shown)
 
 
 def report_of(seen: SeenFrame, counted: Counted) -> StepReport:
     """What the step says of a frame."""
     return StepReport(
-        points_valid=seen.valid,
-        points_in_range=seen.in_range,
-        points_kept=seen.sighting.labels.keep.sum(),
+        points_valid=counted.valid,
+        points_in_range=counted.in_range,
+        points_kept=counted.kept,
         voxels_hit=counted.hits,
         voxels_freed=counted.freed,
         estimate=seen.estimate,

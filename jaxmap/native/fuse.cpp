@@ -9,6 +9,7 @@
 #include <atomic>
 #include <cstdint>
 #include <cstring>
+#include <iterator>
 #include <limits>
 
 #include "fuse_carve.h"
@@ -42,24 +43,28 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
   float* across = work->across.of(frame.width);
   for (int64_t column = 0; column < frame.width; ++column) across[column] = (float(column) - n.cx) * (1.0f / n.fx);
 
-  in_parallel(pool, tiles, [&](int64_t tile) { sum_tile(frame, tile, *work); });
-  std::atomic<int32_t> hits{0}, freed{0};
+  std::atomic<int32_t> hits{0}, freed{0}, valid{0}, in_range{0}, kept{0};
+  in_parallel(pool, tiles, [&](int64_t tile) {
+    const PixelCounts counts = sum_tile(frame, tile, *work);
+    valid += counts.valid, in_range += counts.in_range, kept += counts.kept;
+  });
   in_parallel(pool, threads, [&](int64_t share) {
     gather_tiles(frame, tiles, share, threads, *work);
     hits += add_hits(frame, *work, work->voxels[share]);
     if (frame.surface != nullptr) add_heights(frame, work->columns[share]);
   });
   if (frame.carve) {
-    const int64_t depth = frame.shape[2], of_plane = frame.shape[1] * depth;
-    float *y_of = work->plane_y.of(of_plane), *z_of = work->plane_z.of(of_plane);
-    for (int64_t j = 0; j < of_plane; ++j) y_of[j] = frame.centre(1, j / depth), z_of[j] = frame.centre(2, j % depth);
-    in_parallel(pool, frame.shape[0], [&](int64_t plane) { freed += carve_plane(frame, plane, y_of, z_of, *work); });
+    const View view(frame);
+    float* along = work->along.of(frame.shape[1]);
+    for (int64_t y = 0; y < frame.shape[1]; ++y) along[y] = frame.centre(1, y);
+    in_parallel(pool, frame.shape[0], [&](int64_t plane) { freed += carve_plane(frame, view, plane, *work); });
   }
   for (int64_t share = 0; share < threads; ++share) {
     work->voxels[share].clear(work->voxel_slots.data());
     work->columns[share].clear(work->column_slots.data());
   }
-  counted[0] = hits, counted[1] = freed;
+  const int32_t numbers[] = {hits, freed, valid, in_range, kept};
+  std::copy(std::begin(numbers), std::end(numbers), counted);  // `fusion.frame.Counted`
   Workspace::give_back(std::move(work));
 }
 

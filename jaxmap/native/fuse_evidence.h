@@ -12,6 +12,7 @@
 namespace jaxmap {
 
 constexpr float kLeastWeight = 1e-12f;
+constexpr int kAhead = 16;  // voxels whose memory is asked for before it is needed
 
 // Adds up what the tiles saw of one share of the columns, in the order of the tiles.
 inline void gather_tiles(const Frame& frame, int64_t tiles, int64_t share, int64_t shares, Workspace& work) {
@@ -20,6 +21,7 @@ inline void gather_tiles(const Frame& frame, int64_t tiles, int64_t share, int64
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int64_t begin = tile * kTilePixels, end = begin + work.seen_of_tile.get()[tile];
     for (int64_t seen = begin; seen < end; ++seen) {
+      if (seen + kAhead < end) __builtin_prefetch(work.voxel_slots.data() + work.seen.get()[seen + kAhead]);
       const int32_t voxel = work.seen.get()[seen], column = voxel / depth, z = voxel % depth;
       if (column % shares != share) continue;
       const float* sums = work.sums.get() + seen * rows;
@@ -60,17 +62,24 @@ inline int32_t add_hits(const Frame& frame, Workspace& work, const Sums<float>& 
   const int classes = frame.classes, rows = classes + 1;
   const int64_t map_voxels = frame.map_voxels();
   std::vector<float> shares(classes);
+  const auto cell_of = [&](int32_t voxel) {
+    const int32_t depth = frame.shape[2], column = voxel / depth, width = frame.shape[1];
+    return frame.log_odds + frame.cell(column / width, column % width, voxel % depth);
+  };
   int32_t hits = 0;
   for (size_t k = 0; k < voxels.places.size(); ++k) {
     const float* row = voxels.rows.data() + k * rows;
-    const int32_t voxel = voxels.places[k], depth = frame.shape[2], column = voxel / depth;
+    const int32_t voxel = voxels.places[k];
+    if (k + kAhead < voxels.places.size())
+      for (int row = 0; row < rows; ++row)
+        __builtin_prefetch(cell_of(voxels.places[k + kAhead]) + row * map_voxels, 1);
     float points = row[0];
     for (int r = 1; r < rows; ++r) points += row[r];
     // Points without weight say nothing: the voxel may still be free.
     if (points == 0) work.voxel_slots[voxel] = 0;
     hits += points > 0;
     const float amount = share_out(frame, row, points, shares.data());
-    float* cell = frame.log_odds + frame.cell(column / frame.shape[1], column % frame.shape[1], voxel % depth);
+    float* cell = cell_of(voxel);
     *cell += amount * frame.numbers.hit;
     for (int to = 0; to < classes; ++to) {
       float gain = 0;

@@ -50,9 +50,13 @@ struct Frame {
   float* surface;             // (4, columns and layers of the map), or null
   int64_t layer, map_layers;  // voxels of the lattice to a layer, and layers of the map
 
-  // Weights by class and of none; number, weight and first two moments of heights.
+  // What is summed up over the points of a voxel: weights by class and of none; number, weight and first two moments of
+  // heights. A point with a label has one weight, which goes to the row of its class.
   int class_rows() const { return classes + 1; }
-  int rows() const { return class_rows() + (surface ? 4 : 0); }
+  int height_rows() const { return surface ? 4 : 0; }
+  int rows() const { return class_rows() + height_rows(); }
+  int weight_rows() const { return labels ? 1 : class_rows(); }
+  int value_rows() const { return weight_rows() + height_rows(); }
 
   int64_t columns() const { return shape[0] * shape[1]; }
   int64_t voxels() const { return columns() * shape[2]; }
@@ -102,8 +106,7 @@ struct Workspace {
   std::vector<int32_t> voxel_slots, column_slots;
   std::vector<Sums<float>> voxels;   // of each thread
   std::vector<Sums<double>> columns;
-  Scratch<float> across;            // of each column of pixels: x at depth 1
-  Scratch<float> plane_y, plane_z;  // of the voxels of a plane of the window
+  Scratch<float> across, along;  // of each column of pixels x at depth 1, of each row of voxels y
   // Up to which depth the camera saw free space through each pixel, and the farthest of each block of pixels.
   Scratch<float> reach, block_reach;
   // Of each voxel that a tile of pixels saw: its place, and the sums over those pixels.

@@ -40,22 +40,6 @@ inline void store_some(float* to, Vector value, int64_t count) {
   std::memcpy(to, &value, count * sizeof(float));
 }
 
-// The same with zeros in all lanes but the first `count`.
-inline Vector first_lanes(Vector value, int count) {
-  Vector lane;
-  for (int i = 0; i < kLanes; ++i) lane[i] = float(i);
-  return lane < all(float(count)) ? value : Vector{};
-}
-
-// The sum of all lanes, pair by pair.
-inline float sum_of(Vector value) {
-  float lanes[kLanes];
-  store(lanes, value);
-  for (int half = kLanes / 2; half > 0; half /= 2)
-    for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
-  return lanes[0];
-}
-
 // An array that a thread or a workspace keeps from call to call, as fresh pages cost more than what is done with them.
 // It grows, and then forgets what it held.
 template <typename Number>
