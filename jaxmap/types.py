@@ -133,7 +133,8 @@ class Frame:
     the rectified left one, grey or RGB; `logits` are what a network has made of it, at its own resolution. One of
     `image`, `labels`, `class_probabilities` and `logits` is present where the labeller asks for it, so that every frame
     of a sequence has the same structure; `pose_errors` are those of the members of an ensemble, where there is one
-    (`ensemble.draws.draw_pose_errors`).
+    (`ensemble.draws.draw_pose_errors`). `show` asks the step for the labels of the pixels (`StepReport.labels`); it is
+    None where no frame of a sequence does.
     """
 
     disparity_px: Float[Array, "H W"] | None
@@ -145,6 +146,7 @@ class Frame:
     pose_errors: Float[Array, "M 6"] | None = None
     right_image: Shaped[Array, "H W *rgb"] | None = None
     blind: Bool[Array, "H W"] | None = None
+    show: Bool[Array, ""] | None = None
 
     @property
     def matched_px(self) -> Float[Array, "H W"]:

@@ -17,8 +17,9 @@ from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import add_evidence, count_points
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.fusion.sensor_model import frame_evidence, total_weight
-from jaxmap.fusion.surface import add_heights, gather_heights
+from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
+from jaxmap.fusion.surface import add_heights, gather_heights, height_sigma
+from jaxmap.geometry.cloud import project
 from jaxmap.types import GridSpec, PointLabels, StereoCamera, VoxelMap
 
 
@@ -28,29 +29,32 @@ class Sighting(NamedTuple):
     Attributes:
         camera: the rectified camera.
         T_world_camera: its pose.
-        points_world: metres, one for each pixel.
-        labels: of the points, and which of them count.
-        weights: how much each point counts.
-        height_sigma_m: standard deviation of the height of each point, where heights are kept.
-        depth_m: along the optical axis.
-        valid: pixels that have a depth.
+        disparity_px: NaN where unknown.
+        labels: of the points of the pixels, and which of them count.
     """
 
     camera: StereoCamera
     T_world_camera: jaxlie.SE3
-    points_world: Float[Array, "N 3"]
+    disparity_px: Float[Array, "H W"]
     labels: PointLabels
-    weights: Float[Array, "N"]
-    height_sigma_m: Float[Array, "N"] | None
-    depth_m: Float[Array, "H W"]
-    valid: Bool[Array, "H W"]
 
 
 class Counted(NamedTuple):
-    """How many voxels of a window a frame hit with points, and how many others it saw through."""
+    """What a frame did.
+
+    Attributes:
+        hits: voxels of the window that hold points.
+        freed: others that it saw through.
+        valid: pixels that have a depth.
+        in_range: those between the depths that are mapped.
+        kept: those whose points count.
+    """
 
     hits: Int[Array, ""]
     freed: Int[Array, ""]
+    valid: Int[Array, ""]
+    in_range: Int[Array, ""]
+    kept: Int[Array, ""]
 
 
 class Evidence(NamedTuple):
@@ -76,19 +80,21 @@ def evidence_of(
         grid: that of the map.
         window: of it.
         params: the sensor model, whose matrix gives the number of classes.
-        rule: how the points of a frame add up, and whether it carves.
+        rule: how the points of a frame add up, whether it carves, and whether heights are kept.
         depth_range_m: voxels nearer or farther are not seen through.
     """
-    points_world, labels = sighting.points_world, sighting.labels
-    free = None
-    if rule.carve:
-        pose, depth_m = sighting.T_world_camera, sighting.depth_m
-        free = carve(sighting.camera, pose, depth_m, sighting.valid, window, params, depth_range_m)
-    counts = count_points(window, points_world, labels, sighting.weights, params.class_increments.shape[0])
+    camera, pose, disparity_px, labels = sighting
+    cloud = project(camera, pose, disparity_px, depth_range_m, params.disparity_sigma_px)
+    labels = labels._replace(keep=labels.keep & cloud.valid.reshape(-1))
+    free = carve(camera, pose, cloud.depth_m, cloud.valid, window, params, depth_range_m) if rule.carve else None
+    weights = point_weights(grid, cloud, rule)
+    counts = count_points(window, cloud.points_world, labels, weights, params.class_increments.shape[0])
     heights = None
-    if sighting.height_sigma_m is not None:
-        heights = gather_heights(grid, window, points_world, sighting.height_sigma_m, labels.keep)
-    counted = _count_voxels(total_weight(counts) > 0, free)
+    if rule.surface:
+        sigma_m = height_sigma(cloud, pose.translation()[2])
+        heights = gather_heights(grid, window, cloud.points_world, sigma_m, labels.keep)
+    hits, freed = _count_voxels(total_weight(counts) > 0, free)
+    counted = Counted(hits, freed, cloud.valid.sum(), cloud.in_range.sum(), labels.keep.sum())
     return Evidence(frame_evidence(counts, free, params, rule), heights, counted)
 
 
@@ -113,8 +119,8 @@ def add_plainly(
     return add_evidence_of(voxel_map, evidence, window), evidence.counted
 
 
-def _count_voxels(hits: Bool[Array, "X Y Z"], free: Bool[Array, "X Y Z"] | None) -> Counted:
+def _count_voxels(hits: Bool[Array, "X Y Z"], free: Bool[Array, "X Y Z"] | None) -> tuple[Int[Array, ""], Int[Array, ""]]:
     freed = jnp.zeros_like(hits) if free is None else free & ~hits
     # Both in one sum, the second above 16 bits, and first along the short axis: thrice as fast as two sums.
     both = (hits.astype(jnp.int32) + (freed.astype(jnp.int32) << 16)).sum(axis=2)
-    return Counted((both & 0xFFFF).sum(), (both >> 16).sum())
+    return (both & 0xFFFF).sum(), (both >> 16).sum()

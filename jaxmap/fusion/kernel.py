@@ -37,7 +37,7 @@ def add_sighting(
     rule: FusionRule,
     depth_range_m: tuple[float, float],
 ) -> tuple[VoxelMap, Counted]:
-    """Adds a frame to a map; also tells how many voxels it touched.
+    """Adds a frame to a map; also counts its points and the voxels it touched.
 
     Args:
         voxel_map: the map so far.
@@ -87,18 +87,12 @@ def _by_kernel(
     rule: FusionRule,
     depth_range_m: tuple[float, float],
 ) -> tuple[VoxelMap, Counted]:
-    labels, weights = sighting.labels, sighting.weights
-    log_odds, surface = voxel_map.log_odds, voxel_map.surface
-    height_weights = jnp.zeros(0)
-    if surface is None:
+    labels, log_odds, surface = sighting.labels, voxel_map.log_odds, voxel_map.surface
+    if surface is None or not rule.surface:
         surface = jnp.zeros((4, 0, 0, 0))
-    elif sighting.height_sigma_m is not None:
-        sigma_m = sighting.height_sigma_m
-        height_weights = jnp.where(jnp.isfinite(sigma_m), 1.0 / (sigma_m**2 + POSE_SIGMA_M**2), 0.0)
-    # Column by column, as XLA has them before it stacks them: nothing is copied.
-    columns = [sighting.points_world[:, axis] for axis in range(3)]
     hard, shares = jnp.zeros(0, jnp.int32), []
     if labels.probabilities is not None:
+        # Class by class, as XLA has them before it stacks them: nothing is copied.
         shares = [labels.probabilities[:, index] for index in range(len(voxel_map.classes))]
     elif labels.labels is not None:
         hard = labels.labels.astype(jnp.int32)
@@ -108,16 +102,15 @@ def _by_kernel(
         (
             jax.ShapeDtypeStruct(log_odds.shape, log_odds.dtype),
             jax.ShapeDtypeStruct(surface.shape, surface.dtype),
-            jax.ShapeDtypeStruct((2,), jnp.int32),
+            jax.ShapeDtypeStruct((len(Counted._fields),), jnp.int32),
         ),
         input_output_aliases={0: 0, 1: 1},
         vmap_method="sequential",
     )
     with jax.named_scope("fuse"):
         new_log_odds, new_surface, counted = call(
-            *(log_odds, surface, _numbers(sighting, window, params, depth_range_m), places),
-            *(*columns, labels.keep, hard, weights, height_weights),
-            *(jnp.where(sighting.valid, sighting.depth_m, 0.0), *shares),
+            *(log_odds, surface, _numbers(sighting, window, params, rule, depth_range_m), places),
+            *(sighting.disparity_px, labels.keep, hard, *shares),
             shape=np.asarray(window.shape, np.int64),
             layer=np.int64(LAYER),
             carve=rule.carve,
@@ -126,25 +119,23 @@ def _by_kernel(
     fused = replace(
         voxel_map,
         log_odds=new_log_odds,
-        surface=None if voxel_map.surface is None else new_surface,
+        surface=new_surface if surface.size else voxel_map.surface,
         frames_fused=voxel_map.frames_fused + 1,
     )
-    return fused, Counted(counted[0], counted[1])
+    return fused, Counted(*counted)
 
 
 def _numbers(
-    sighting: Sighting, window: GridSpec, params: FusionParams, depth_range_m: tuple[float, float]
+    sighting: Sighting, window: GridSpec, params: FusionParams, rule: FusionRule, depth_range_m: tuple[float, float]
 ) -> Float[Array, "K"]:
     """`Numbers` of the kernel, and the matrix of increments."""
-    camera, T_camera_world = sighting.camera, sighting.T_world_camera.inverse()
-    margin_m = 0.5 * jnp.linalg.norm(window.voxel_size_m)
-    sigmas = MARGIN_SIGMAS * depth_sigma(camera, jnp.ones(()), params.disparity_sigma_px)
-    prior = params.occupancy_prior
+    camera, pose, size_m, prior = sighting.camera, sighting.T_world_camera, window.voxel_size_m, params.occupancy_prior
+    sigma = depth_sigma(camera, jnp.ones(()), params.disparity_sigma_px)
     parts = [
-        *(T_camera_world.rotation().as_matrix(), T_camera_world.translation()),
-        *(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
-        *(margin_m, sigmas, *depth_range_m, window.lattice_m, window.voxel_size_m),
-        sighting.T_world_camera.translation()[2],
+        *(part for T in (pose, pose.inverse()) for part in (T.rotation().as_matrix(), T.translation())),
+        *(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.doffs_px, camera.baseline_m * camera.fx_px),
+        *(sigma, 1.0 / size_m.mean() if rule.range_weighting else 0.0, POSE_SIGMA_M**2),
+        *(0.5 * jnp.linalg.norm(size_m), MARGIN_SIGMAS * sigma, *depth_range_m, window.lattice_m, size_m),
         *(params.occupancy_hit - prior, params.occupancy_miss - prior, params.full_evidence_points),
         params.class_increments,
     ]

@@ -58,8 +58,10 @@ def project(
     in_range = valid & (depth_m >= depth_range_m[0]) & (depth_m <= depth_range_m[1])
     points_world = transform_points(T_world_camera, points_camera)
     columns = [points_world[..., axis].reshape(-1) for axis in range(3)]
-    # Kept apart: each reader would compute the points anew, one by one. In columns, for readers of columns.
-    columns, depth_m, in_range = jax.lax.optimization_barrier((columns, depth_m, in_range))
+    # Kept apart: each reader would compute the points anew, one by one. In columns, for readers of columns; and by
+    # themselves, so that without readers they are not computed at all.
+    columns = jax.lax.optimization_barrier(columns)
+    depth_m, in_range = jax.lax.optimization_barrier((depth_m, in_range))
     points_world = jnp.stack(columns, axis=-1)
     relief = None
     if ground is not None:

@@ -15,6 +15,7 @@ from jaxmap.fusion.options import FusionRule
 from jaxmap.geometry.cloud import PointCloud
 from jaxmap.geometry.options import GroundOptions
 from jaxmap.geometry.relief import to_pixels
+from jaxmap.labellers.shares import Odds
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, PointLabels
 
@@ -59,11 +60,14 @@ class PointFeatures(NamedTuple):
             range. The features need never be held all at once. Further features, where they are given, follow the
             labeller's own: an image (h, w, E) of relief, whose pixels are `RELIEF_STRIDE` of the frame's wide.
         of_frame: a pytree of the whole frame.
+        label: what `map` makes of the labeller's own `label` with these numbers, in one go; None where there is no such
+            way. It takes odds that relief adds.
     """
 
     keep: Bool[Array, "N"]
     map: FeatureMap
     of_frame: PyTree = ()
+    label: Callable[[Numbers, Odds | None], tuple[Float[Array, "N"], ...]] | None = None
 
 
 class LabellerParams(NamedTuple):
@@ -129,7 +133,10 @@ def labels_of(labeller: Labeller, features: PointFeatures, estimate: PyTree, num
     choose, keep = labeller.keep, features.keep
     if choose is not None:
         keep = keep & features.map(lambda values: choose(values, estimate))[0]
-    labels = features.map(lambda values: labeller.label(values, estimate, numbers))
+    if features.label is not None:
+        labels = features.label(numbers, None)
+    else:
+        labels = features.map(lambda values: labeller.label(values, estimate, numbers))
     if labeller.soft:
         # They are never stored side by side: each scatter reads its own one.
         return PointLabels(keep, probabilities=jnp.stack(labels, axis=-1))

@@ -22,6 +22,7 @@ from jaxmap.geometry.relief import RELIEF_STRIDE, relief_channels
 from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, Pointwise
 from jaxmap.labellers.options import DeeplabOptions
 from jaxmap.labellers.relief import floating_points, ground_seen
+from jaxmap.labellers.shares import Odds, merged_softmax, pixel_shares
 from jaxmap.labels import IGNORE
 from jaxmap.models.architecture import Architecture
 from jaxmap.models.checkpoint import SavedModel
@@ -147,10 +148,6 @@ def make_logits_labeller(
     options = replace(options or DeeplabOptions(), **changes)
     mapped = map_classes(architecture.classes, classes, options.class_map)
     ground = GroundOptions() if architecture.relief_channels and options.see_relief else None
-    groups = [
-        [index for index, target in enumerate(mapped.targets) if target == wanted]
-        for wanted in range(len(mapped.classes))
-    ]
 
     def features(frame: Frame, cloud: PointCloud, params: LabellerParams, key: Array) -> PointFeatures:
         coarse, image_px, keep = frame.logits, cloud.valid.shape, cloud.in_range.reshape(-1)
@@ -166,11 +163,16 @@ def make_logits_labeller(
                 images = map_pixels(function, coarse, places, more, RELIEF_STRIDE, cloud.in_range)
                 return tuple(image.reshape(-1) for image in images)
 
-        return PointFeatures(keep, map_rows, of_frame)
+        def label_all(numbers: Numbers, odds: Odds | None) -> tuple[Array, ...]:
+            with jax.named_scope("pixel_labels"):
+                temperature, count = numbers["temperature"], len(mapped.classes)
+                return pixel_shares(coarse, places, mapped.targets, count, temperature, cloud.in_range, odds)
+
+        return PointFeatures(keep, map_rows, of_frame, label_all if options.soft else None)
 
     def label(logits: Array, estimate: Any, numbers: Numbers) -> tuple[Array, ...]:
         if options.soft:
-            return _merged_softmax(logits / numbers["temperature"], groups)
+            return merged_softmax(logits / numbers["temperature"], mapped.targets, len(mapped.classes))
         return (_likeliest(logits, mapped.targets),)
 
     numbers = {"temperature": to_device(options.temperature, np.float32)} if options.soft else {}
@@ -203,15 +205,6 @@ def _image(frame: Frame, cloud: PointCloud) -> UInt8[Array, "H W 3"]:
             fix="give the rectified left image, grey or RGB",
         )
     return image
-
-
-def _merged_softmax(logits: Float[Array, "N D *w"], groups: list[list[int]]) -> tuple[Float[Array, "N *w"], ...]:
-    """The summed probability of each group of classes."""
-    powers = jnp.exp(logits - jax.lax.stop_gradient(logits.max(axis=1, keepdims=True)))
-    # Without the barriers they would be computed anew for each group.
-    powers = jax.lax.optimization_barrier(powers)
-    scale = jax.lax.optimization_barrier(1.0 / powers.sum(axis=1))
-    return tuple(sum(powers[:, index] for index in group) * scale for group in groups)
 
 
 def _likeliest(logits: Float[Array, "N D *w"], targets: Sequence[int]) -> Int[Array, "N *w"]:

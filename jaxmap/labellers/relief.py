@@ -21,6 +21,7 @@ from jaxmap.geometry.cloud import PointCloud
 from jaxmap.geometry.relief import box_sums, to_pixels
 from jaxmap.labellers.base import Labeller, LabellerParams, Numbers, PointFeatures, Pointwise
 from jaxmap.labellers.options import ReliefOptions
+from jaxmap.labellers.shares import Odds, with_odds
 from jaxmap.labels import IGNORE
 from jaxmap.types import Frame, to_device
 
@@ -129,7 +130,13 @@ def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None
         def map_both(function: Pointwise, more: Array | None = None) -> tuple[Array, ...]:
             return inner.map(function, relief if more is None else jnp.concatenate([relief, more], axis=-1))
 
-        return PointFeatures(inner.keep & ~floating_points(cloud), map_both, ground_seen(cloud, inner.of_frame))
+        def label_all(numbers: Numbers, odds: Odds | None) -> tuple[Array, ...]:
+            assert inner.label is not None and odds is None
+            log_odds = _added_odds(relief.reshape(-1, _FEATURES), numbers).reshape(relief.shape[:2])
+            return inner.label(numbers, Odds(rock, log_odds, numbers["label_gain"]))
+
+        keep, of_frame = inner.keep & ~floating_points(cloud), ground_seen(cloud, inner.of_frame)
+        return PointFeatures(keep, map_both, of_frame, None if inner.label is None else label_all)
 
     def estimate(of_frame: GroundSeen, numbers: Numbers) -> GroundSeen:
         return of_frame._replace(own=labeller.estimate(of_frame.own, numbers))
@@ -146,15 +153,7 @@ def combine_with_relief(labeller: Labeller, options: ReliefOptions | None = None
                 jnp.where(there, jnp.where(given[0] == index, options.certainty, doubt), 0.0)
                 for index in range(len(classes))
             ]
-        ratio = numbers["weight"] * (rock_log_odds(relief, numbers) + numbers["offset"])
-        odds = jnp.where(relief[:, 3] > 0, ratio, 0.0).clip(-_MOST_LOG_ODDS, _MOST_LOG_ODDS)
-        total = sum(shares)
-        # A power takes XLA four times as long as its logarithm and exponential.
-        logs = [numbers["label_gain"] * jnp.log(jnp.maximum(share, 1e-7)) for share in shares]
-        logs[rock] = logs[rock] + odds
-        powers = [jnp.exp(log) for log in logs]
-        scale = total / sum(powers)
-        return tuple(power * scale for power in powers)
+        return with_odds(shares, rock, _added_odds(relief, numbers), numbers["label_gain"])
 
     def keep(values: Array, estimate: GroundSeen) -> tuple[Array]:
         assert labeller.keep is not None
@@ -180,6 +179,12 @@ def rock_log_odds(values: Float[Array, "N 4 *w"], numbers: Numbers) -> Float[Arr
         wide_m = jnp.sqrt(numbers["softness_m"] ** 2 + (numbers["noise"] * sigma_m) ** 2)
         rise = jnp.tanh((height_m - numbers["threshold_m"]) / wide_m)
         return numbers["bias"] + numbers["height_gain"] * rise + numbers["slope_gain"] * angle
+
+
+def _added_odds(values: Float[Array, "N 4 *w"], numbers: Numbers) -> Float[Array, "N *w"]:
+    """What relief adds to the log-odds of rock that a labeller gives."""
+    ratio = numbers["weight"] * (rock_log_odds(values, numbers) + numbers["offset"])
+    return jnp.where(values[:, 3] > 0, ratio, 0.0).clip(-_MOST_LOG_ODDS, _MOST_LOG_ODDS)
 
 
 def floating_points(cloud: PointCloud) -> Bool[Array, "N"]:

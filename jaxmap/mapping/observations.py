@@ -16,7 +16,7 @@ import shutil
 import threading
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -426,9 +426,14 @@ def _frame_attributes(where: Path) -> _FrameAttributes:
     path = where / "zarr.json"
     check_regular(path, _MOST_ATTRIBUTES_BYTES)
     try:
-        return TypeAdapter(_FrameAttributes).validate_python(read_json(path)["attributes"])
+        return _frame_adapter().validate_python(read_json(path)["attributes"])
     except (KeyError, TypeError, ValidationError) as fault:
         raise JaxmapError("the frame is damaged: its attributes", where=where, fix=_AGAIN) from fault
+
+
+@cache
+def _frame_adapter() -> TypeAdapter[_FrameAttributes]:
+    return TypeAdapter(_FrameAttributes)
 
 
 def _bad_attributes(fault: ValidationError, where: Path) -> JaxmapError:
@@ -445,24 +450,30 @@ def _read_array(where: Path, name: str, shape: Sequence[int]) -> np.ndarray:
     Raises:
         JaxmapError: it is missing, not whole, of another type or shape, or damaged.
     """
-    import zarr
+    from numcodecs.zstd import decompress
 
-    for path in ((where / name / "zarr.json"), where / name / ".".join("c" + "0" * len(shape))):
+    described, chunk = where / name / "zarr.json", where / name / ".".join("c" + "0" * len(shape))
+    for path in (described, chunk):
         check_regular(path, _MOST_FILE_BYTES)
-    fault = f"the {name.replace('_', ' ')} of the frame is damaged"
+    dtype = np.dtype(_DTYPES[name])
+    # What `_write_array` writes is read here: to open an array and read its one chunk takes Zarr as long as all the rest.
     try:
-        array = zarr.open_array(where / name, mode="r", zarr_format=3)
-        form = array.shape, array.chunks, array.dtype
-        if form != (tuple(shape), tuple(shape), _DTYPES[name]):
-            raise JaxmapError(
-                f"{name} is {array.dtype} {array.shape}, not {np.dtype(_DTYPES[name])} {tuple(shape)}", where=where
-            )
-        return np.asarray(array[...])
+        stored = read_json(described)
+        if (form := (stored["data_type"], tuple(stored["shape"]))) != (dtype.name, tuple(shape)):
+            raise JaxmapError(f"{name} is {form[0]} {form[1]}, not {dtype} {tuple(shape)}", where=where)
+        ((raw, options), (codec, _)) = ((one["name"], one.get("configuration", {})) for one in stored["codecs"])
+        chunks = stored["chunk_grid"]["configuration"]["chunk_shape"]
+        if (raw, options.get("endian", "little"), codec, tuple(chunks)) != ("bytes", "little", "zstd", tuple(shape)):
+            raise JaxmapError(f"{name} is stored otherwise than jaxmap stores it", where=where)
+        values = np.empty(shape, dtype.newbyteorder("<"))
+        # Zstandard's own checksum finds damage.
+        decompress(chunk.read_bytes(), values)
     except JaxmapError:
         raise
     # The codec raises whatever it likes on damaged bytes.
     except Exception as error:
-        raise JaxmapError(fault, where=where) from error
+        raise JaxmapError(f"the {name.replace('_', ' ')} of the frame is damaged", where=where) from error
+    return values.astype(dtype, copy=False)
 
 
 def matrix_of(T: Float[np.ndarray, "4 4"]) -> Matrix:

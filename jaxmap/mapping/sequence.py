@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
@@ -194,6 +194,15 @@ def _in_right_order(frames: Iterator[PreparedFrame], front_end: StereoFrontEnd) 
             front_end.check_order(prepared.rectified, f"frame {prepared.ref.name}")
             order_checked = True
         yield prepared
+
+
+def with_labels_shown(frames: Iterable[PreparedFrame], shown: Container[int]) -> Iterator[PreparedFrame]:
+    """The same frames, some of which, by their index, ask the step for the labels of their pixels."""
+    for prepared in frames:
+        frame = prepared.frame
+        if frame is not None:
+            frame = replace(frame, show=to_device(prepared.index in shown, np.bool_))
+        yield replace(prepared, frame=frame)
 
 
 def frame_form(

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from jaxmap.ensemble.draws import EnsembleParams
 from jaxmap.ensemble.members import fuse_members
@@ -21,8 +21,6 @@ from jaxmap.fusion.frame import Counted, Sighting
 from jaxmap.fusion.kernel import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import FusionParams
-from jaxmap.fusion.sensor_model import point_weights
-from jaxmap.fusion.surface import height_sigma
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.labellers.base import NO_NUMBERS, Labeller, LabellerParams, fusible, harden, label_points
@@ -30,7 +28,7 @@ from jaxmap.labels import IGNORE
 from jaxmap.matching.design import MatchDesign, MatchParams
 from jaxmap.matching.match import match
 from jaxmap.matching.rectify import RawPair, rectify_pair, rectifying_rotations
-from jaxmap.types import Frame, GridSpec, StereoCamera, VoxelMap, make_voxel_map
+from jaxmap.types import Frame, GridSpec, PointLabels, StereoCamera, VoxelMap, make_voxel_map
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -58,7 +56,8 @@ class StepReport(NamedTuple):
 
     `points_valid` have a disparity, `points_in_range` lie between the depths, `points_kept` were
     kept by the labeller; `voxels_hit` hold points, `voxels_freed` were seen through; `estimate` is
-    the labeller's, of the whole frame (the `Plane` of the plane labeller).
+    the labeller's, of the whole frame (the `Plane` of the plane labeller). `labels` are those of the pixels, as
+    `Mapper.label_image` gives them: zeros where `Frame.show` is false, None where it is None.
     """
 
     points_valid: Int[Array, ""]
@@ -67,6 +66,7 @@ class StepReport(NamedTuple):
     voxels_hit: Int[Array, ""]
     voxels_freed: Int[Array, ""]
     estimate: PyTree
+    labels: UInt8[Array, "H W"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +107,14 @@ def in_full_float32(function: Callable[Arguments, Result]) -> Callable[Arguments
 class SeenFrame(NamedTuple):
     """What one frame shows, before it is added to a map: its labelled points, and the window of the map they lie in.
 
-    `frame` is itself, matched.
+    `frame` is itself, matched; `shown` are its labels as an image, where it asks for them.
     """
 
     sighting: Sighting
     window: GridSpec
     frame: Frame
-    in_range: Int[Array, ""]
     estimate: PyTree
+    shown: UInt8[Array, "H W"] | None
 
 
 @in_full_float32
@@ -147,23 +147,23 @@ def see_frame(
 
     cloud = project(camera, pose, frame.matched_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
     labels, estimate = label_points(labeller, frame, cloud, params.labeller, frame_key)
+    shown = None if frame.show is None else _shown(frame.show, labels, cloud.valid.shape)
     labels = fusible(labels, labeller.classes, rule)
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
-    weights = point_weights(grid, cloud, rule)
-    height_sigma_m = height_sigma(cloud, pose.translation()[2]) if rule.surface else None
-    sighting = Sighting(camera, pose, cloud.points_world, labels, weights, height_sigma_m, cloud.depth_m, cloud.valid)
-    return SeenFrame(sighting, window, frame, cloud.in_range.sum(), estimate)
+    sighting = Sighting(camera, pose, frame.matched_px, labels)
+    return SeenFrame(sighting, window, frame, estimate, shown)
 
 
 def report_of(seen: SeenFrame, counted: Counted) -> StepReport:
     """What the step says of a frame."""
     return StepReport(
-        points_valid=seen.sighting.valid.sum(),
-        points_in_range=seen.in_range,
-        points_kept=seen.sighting.labels.keep.sum(),
+        points_valid=counted.valid,
+        points_in_range=counted.in_range,
+        points_kept=counted.kept,
         voxels_hit=counted.hits,
         voxels_freed=counted.freed,
         estimate=seen.estimate,
+        labels=seen.shown,
     )
 
 
@@ -232,9 +232,29 @@ def label_image(
     sigma_px, ground = params.fusion.disparity_sigma_px, design.labeller.ground
     frame, camera = matched(design.match, frame, params)
     cloud = project(camera, frame.T_world_camera, frame.matched_px, design.depth_range_m, sigma_px, ground)
-    labels = harden(label_points(design.labeller, frame, cloud, params.labeller, frame_key)[0])
+    labels, _ = label_points(design.labeller, frame, cloud, params.labeller, frame_key)
+    return _as_image(labels, cloud.valid.shape)
+
+
+def _as_image(labels: PointLabels, image_px: tuple[int, ...]) -> UInt8[Array, "H W"]:
+    """The labels of all points, `IGNORE` where none is kept."""
+    labels = harden(labels)
     assert labels.labels is not None
-    return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(cloud.valid.shape)
+    return jnp.where(labels.keep, labels.labels, IGNORE).astype(jnp.uint8).reshape(image_px)
+
+
+def _shown(show: Bool[Array, ""], labels: PointLabels, image_px: tuple[int, ...]) -> UInt8[Array, "H W"]:
+    """The labels as an image, for the price of an empty one where nobody asks."""
+    # Class by class, as XLA has them before it stacks them: other frames then need no stack.
+    soft = labels.probabilities
+    shares = [] if soft is None else [soft[:, index] for index in range(soft.shape[1])]
+
+    def image() -> UInt8[Array, "H W"]:
+        stacked = jnp.stack(shares, axis=-1) if shares else None
+        return _as_image(labels._replace(probabilities=stacked), image_px)
+
+    with jax.named_scope("show"):
+        return jax.lax.cond(show, image, lambda: jnp.zeros(image_px, jnp.uint8))
 
 
 Step = Callable[[VoxelMap, Frame, MapperParams, PRNGKeyArray], tuple[VoxelMap, StepReport]]

@@ -99,7 +99,7 @@ def map_pixels(
         The images (H, W) that the function gives.
     """
     height, width = len(places.rows), len(places.columns)
-    rows, columns = _bands(places.rows, _BLOCK_ROWS), _bands(places.columns, _BLOCK_COLUMNS)
+    rows, columns = cut_matrix(places.rows, _BLOCK_ROWS), cut_matrix(places.columns, _BLOCK_COLUMNS)
     # Classes between rows and columns: softmax and maximum over them are fastest there.
     coarse = jnp.swapaxes(coarse, 1, 2)
 
@@ -139,19 +139,22 @@ def map_pixels(
     return tuple(image.reshape(-1, width)[:height] for image in images)
 
 
-class _Bands(NamedTuple):
+class Bands(NamedTuple):
     """The rows of a matrix in bands, without most of the zeros: the column where each band starts, and its numbers."""
 
     starts: Int[np.ndarray, "bands"]
     weights: Float[np.ndarray, "bands size near"]
 
 
-def _bands(matrix: Float[np.ndarray, "pixels coarse"], size: int) -> _Bands:
-    """Cuts the matrix of an axis: neighbouring pixels depend on few coarse ones, and those are neighbours."""
+def cut_matrix(matrix: Float[np.ndarray, "pixels coarse"], size: int) -> Bands:
+    """Cuts the matrix of an axis into bands of so many pixels.
+
+    Neighbouring pixels depend on few coarse ones, and those are neighbours.
+    """
     missing = -len(matrix) % size
     blocks = np.pad(matrix, ((0, missing), (0, 0))).reshape(-1, size, matrix.shape[1])
     met = [np.flatnonzero(block.any(axis=0)) for block in blocks]
     near = max(int(index[-1] - index[0]) + 1 for index in met)
     starts = np.array([min(int(index[0]), matrix.shape[1] - near) for index in met], np.int32)
     weights = [block[:, start : start + near] for start, block in zip(starts, blocks, strict=True)]
-    return _Bands(starts, np.stack(weights))
+    return Bands(starts, np.stack(weights))

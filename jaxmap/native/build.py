@@ -23,11 +23,18 @@ import jax
 
 from jaxmap.host.cache import cache_folder
 
-TARGET, FUSE_TARGET = "jaxmap_block", "jaxmap_fuse"
+TARGET, FUSE_TARGET, LABELS_TARGET = "jaxmap_block", "jaxmap_fuse", "jaxmap_labels"
 SGM_TARGET, SELECT_TARGET = "jaxmap_sgm", "jaxmap_select"
-"""The kernels' names in compiled programs: blocks of convolutions, a frame into the map, the two halves of matching."""
+"""The kernels' names in compiled programs: blocks of convolutions, a frame into the map, logits to labels, and the two
+halves of matching."""
 
-_SOURCES = {TARGET: "blocks.cpp", FUSE_TARGET: "fuse.cpp", SGM_TARGET: "sgm.cpp", SELECT_TARGET: "select.cpp"}
+_SOURCES = {
+    TARGET: "blocks.cpp",
+    FUSE_TARGET: "fuse.cpp",
+    LABELS_TARGET: "labels.cpp",
+    SGM_TARGET: "sgm.cpp",
+    SELECT_TARGET: "select.cpp",
+}
 _COMPILERS = ("c++", "g++", "clang++")
 # Products and sums may be fused; nothing else may change what is computed.
 _FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-std=c++17", "-shared", "-fPIC", "-w")

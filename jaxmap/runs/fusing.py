@@ -406,11 +406,15 @@ def _fuse_left(work: _Work, workers: Workers, steps: Steps, notify: Notify) -> d
 
 
 def _write_pictures(plan: Plan, folder: RunFolder, numbers: dict[int, int]) -> None:
-    """Writes the pictures of the key frames."""
+    """Writes the pictures of the key frames, with the labels that the steps of the workers gave them."""
     pictures = Pictures(plan, folder)
     for prepared in plan.prepare(sorted(plan.key_frames.keys() & numbers.keys())):
         if prepared.frame is not None:
-            pictures.waiting.append((prepared, numbers[prepared.index]))
+            labels = None
+            if plan.labeller.classes:
+                number = numbers[prepared.index]
+                labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
+            pictures.waiting.append((prepared, labels))
             pictures.write()
 
 

@@ -8,7 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from jaxtyping import UInt8
 
 import jaxmap
 from jaxmap.ensemble.layer import named_layers
@@ -19,7 +21,7 @@ from jaxmap.host.memory import peak_resident_mib
 from jaxmap.host.output_folder import write_json
 from jaxmap.mapping.attributes import MapAttributes
 from jaxmap.mapping.devices import Device, choose_devices, run_on_devices
-from jaxmap.mapping.sequence import FusedFrame, PreparedFrame
+from jaxmap.mapping.sequence import FusedFrame, PreparedFrame, with_labels_shown
 from jaxmap.mapping.store import MapReader, holds_map, in_memory, load_map, open_map, save_map
 from jaxmap.mapping.tiles import MovingBlock, TileStore
 from jaxmap.planning.ground import keeps_layers, map_layers
@@ -94,6 +96,9 @@ def run_plan(
         plan.keeper.begin(folder.observations)
     form = plan.frame_form if log.next_index < len(plan.sequence.frames) else None
     frames = plan.prepare(range(log.next_index, len(plan.sequence.frames)), keep_in=folder.observations)
+    if plan.labeller.classes:
+        form = None if form is None else replace(form, show=jax.ShapeDtypeStruct((), np.bool_))
+        frames = with_labels_shown(frames, plan.key_frames)
     options: dict[str, Any] = {"strict": strict, "form": form, "cover": memory.cover}
     run = run_on_devices(plan.mapper, voxel_map, frames, plan.params, plan.key, devices, **options)
     pictures = Pictures(plan, folder)
@@ -105,7 +110,7 @@ def run_plan(
                 log.compile_s += fused.cost.compile_s
                 # Compilation is timed apart.
                 resumed_s += fused.cost.compile_s
-            pictures.note(fused, log.fused)
+            pictures.note(fused)
             log.add(fused, _disparity_scores(plan, fused))
             resumed_s += pictures.write_many()
             if fused.info is not None:
@@ -345,16 +350,17 @@ def map_attributes(plan: Plan, log: RunLog, voxel_map: VoxelMap | None = None) -
 
 
 class Pictures:
-    """Key frames that wait for their pictures to be written."""
+    """Key frames that wait for their pictures to be written, each with the labels that the step gave its pixels."""
 
     def __init__(self, plan: Plan, folder: RunFolder) -> None:
-        self.plan, self.folder = plan, folder
-        self.waiting: list[tuple[PreparedFrame, int]] = []
+        self.plan, self.folder, self.key_frames = plan, folder, plan.key_frames
+        self.waiting: list[tuple[PreparedFrame, UInt8[np.ndarray, "H W"] | None]] = []
 
-    def note(self, fused: FusedFrame, number: int) -> None:
-        """Keeps a key frame, before which so many were fused; before it counts, so that an interrupt loses none."""
-        if fused.info is not None and fused.prepared.index in self.plan.key_frames:
-            self.waiting.append((fused.prepared, number))
+    def note(self, fused: FusedFrame) -> None:
+        """Keeps a key frame; before it counts, so that an interrupt loses none."""
+        if fused.info is not None and fused.prepared.index in self.key_frames:
+            labels = fused.info.labels
+            self.waiting.append((fused.prepared, None if labels is None else np.asarray(labels)))
 
     def write_many(self) -> float:
         """Writes pictures where many wait, and returns how long that took, in seconds."""
@@ -365,15 +371,11 @@ class Pictures:
         return time.perf_counter() - started_s
 
     def write(self) -> None:
-        """Writes all, with the labels that the step gave each frame as the so manieth."""
-        plan = self.plan
-        for prepared, number in self.waiting:
-            assert prepared.frame is not None and prepared.rectified is not None
-            rectified, labels = plan.front_end.matched(prepared.rectified), None
-            if plan.labeller.classes:
-                labels = np.asarray(plan.mapper.label_image(prepared.frame, plan.params, plan.key, number))
-            large = plan.key_frames[prepared.index]
-            write_key_frame(self.folder, prepared.index, rectified, labels, plan.labeller.classes, large=large)
+        """Writes all."""
+        for prepared, labels in self.waiting:
+            assert prepared.rectified is not None
+            rectified, large = self.plan.front_end.matched(prepared.rectified), self.key_frames[prepared.index]
+            write_key_frame(self.folder, prepared.index, rectified, labels, self.plan.labeller.classes, large=large)
         self.waiting.clear()
 
 

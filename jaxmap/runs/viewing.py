@@ -156,6 +156,7 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
         JaxmapError: rerun is not installed, no display, or the file cannot be written.
     """
     camera, T_world_camera = plan.front_end.camera, plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified
+    key_frames = plan.key_frames
     classes, last, shown_s = plan.labeller.classes, len(plan.sequence.frames) - 1, -np.inf
     with recording(plan.sequence.name, classes, T_world_camera, save) as log:
 
@@ -170,10 +171,8 @@ def live_view(plan: Plan, save: Path | None) -> Iterator[Watch]:
                 if left.size:
                     log.left(left, pinhole(camera), camera.width_px)
                 log.picture("disparity", colourise_disparity(plan.front_end.disparity_of(prepared.rectified)))
-                if classes and prepared.index in plan.key_frames:
-                    number = int(voxel_map.frames_fused) - 1
-                    labels = plan.mapper.label_image(prepared.frame, plan.params, plan.key, number)
-                    log.picture("labels", overlay_labels(left, np.asarray(labels), classes))
+                if fused.info is not None and fused.info.labels is not None and prepared.index in key_frames:
+                    log.picture("labels", overlay_labels(left, np.asarray(fused.info.labels), classes))
             if time.monotonic() - shown_s > _EVERY_S or prepared.index == last:
                 voxels = occupied_voxels(voxel_map, plan.params.fusion, plan.rule)
                 log.voxels("map", voxels.centres_world, voxels.label, voxels.voxel_size_m)

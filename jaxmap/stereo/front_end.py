@@ -13,10 +13,12 @@ from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.host.stages import timed_stage
 from jaxmap.labels import IGNORE
 from jaxmap.stereo.align import alignment_homography, estimate_alignment, match_features
+from jaxmap.stereo.bands import search_bands
 from jaxmap.stereo.blank import blank_reason
+from jaxmap.stereo.coarse import CoarseMatcher
 from jaxmap.stereo.jax_matcher import JaxMatcher, make_matcher
-from jaxmap.stereo.match import Matcher, StereoOptions, as_grey
-from jaxmap.stereo.near import NearGuard
+from jaxmap.stereo.match import Band, Matcher, StereoOptions, as_grey
+from jaxmap.stereo.near import too_near
 from jaxmap.stereo.rectify import Rectifier, StereoRig, make_rectifier, rectify_image, rectify_labels
 from jaxmap.types import StereoCamera
 
@@ -26,10 +28,11 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    The images are empty where observations, which hold none, are read again; the disparity is None where the compiled
-    step finds it. `blind` are pixels that have none, whatever the images show: the raw image does not reach there, or
-    something is too near. `too_near` is the share of pixels that were left out because they are nearer than the
-    searched disparities reach, and `nearest_px` the disparity of the nearest of them.
+    The images are empty where observations are read again; the right one is grey where OpenCV matches it.
+    The disparity is None where the compiled step finds it. `blind` are pixels that have none, whatever the images
+    show: the raw image does not reach there, or something is too near; `bands` say what is searched where.
+    `too_near` is the share of pixels that were left out because they are nearer than all that is searched, and
+    `nearest_px` the disparity of the nearest of them.
     """
 
     left: np.ndarray
@@ -40,6 +43,7 @@ class RectifiedFrame(NamedTuple):
     too_near: float = 0.0
     nearest_px: float = 0.0
     blind: np.ndarray | None = None
+    bands: tuple[Band, ...] = ()
 
 
 class StereoFrontEnd:
@@ -52,7 +56,8 @@ class StereoFrontEnd:
         T_raw_rectified: (4, 4), so that `T_world_raw @ T_raw_rectified` is the rectified pose.
         alignment_rad: rotation vector by which the rectified right camera is corrected, or None.
         matcher: of the rectified images.
-        near_guard: finds what is too near for the matcher, or None where that was not asked for.
+        coarse: matches small images, which tell what is too near for the matcher, and what it need not search; None
+            where neither was asked for.
     """
 
     def __init__(
@@ -81,7 +86,8 @@ class StereoFrontEnd:
         self.rectified_here = self.rectifier is not None
         self.camera: StereoCamera = camera
         self.matcher: Matcher | JaxMatcher = make_matcher(options, camera.width_px)
-        self.near_guard = NearGuard(self.matcher, camera.width_px) if options.near_guard else None
+        narrows = isinstance(self.matcher, Matcher) and self.matcher.narrows
+        self.coarse = CoarseMatcher(self.matcher, camera.width_px) if options.near_guard or narrows else None
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> RectifiedFrame:
         """Rectifies and matches one pair.
@@ -110,15 +116,28 @@ class StereoFrontEnd:
             for side, image in (("left", left), ("right", right)):
                 if (reason := blank_reason(image)) is not None:
                     raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
-            left, right = self.rectify(left, right)
+            # OpenCV's matcher takes grey images; nothing else looks at the right one, which is a third to rectify then.
+            left, right = self.rectify(left, as_grey(right) if isinstance(self.matcher, Matcher) else right)
         blind = None if self.rectifier is None else ~self.rectifier.seen
+        frame = RectifiedFrame(left, right, None, stages_s["rectify"], 0.0, blind=blind)
         with timed_stage("match", stages_s):
-            near = None if self.near_guard is None else self.near_guard(as_grey(left), as_grey(right))
-        times_s = stages_s["rectify"], stages_s["match"]
+            frame = self._glanced_at(frame)
+        return frame._replace(match_s=stages_s["match"])
+
+    def _glanced_at(self, frame: RectifiedFrame) -> RectifiedFrame:
+        """The frame with what small images show of it."""
+        if self.coarse is None:
+            return frame
+        coarse, matcher = self.coarse(frame.left, frame.right), self.matcher
+        image_px = frame.left.shape[:2]
+        if isinstance(matcher, Matcher) and matcher.narrows:
+            frame = frame._replace(bands=search_bands(coarse, matcher, image_px[0]))
+        limit_px = matcher.options.min_disparity_px + matcher.num_disparities
+        near = too_near(coarse, limit_px, image_px) if matcher.options.near_guard else None
         if near is None:
-            return RectifiedFrame(left, right, None, *times_s, blind=blind)
-        blind = near.pixels if blind is None else blind | near.pixels
-        return RectifiedFrame(left, right, None, *times_s, float(near.pixels.mean()), near.disparity_px, blind)
+            return frame
+        blind = near.pixels if frame.blind is None else frame.blind | near.pixels
+        return frame._replace(too_near=float(near.pixels.mean()), nearest_px=near.disparity_px, blind=blind)
 
     def matched(self, frame: RectifiedFrame) -> RectifiedFrame:
         """The frame with its disparity."""
@@ -128,7 +147,10 @@ class StereoFrontEnd:
         """The disparity of a rectified pair, float32 (H, W): its own, or matched now where the step finds it."""
         if frame.disparity_px is not None:
             return frame.disparity_px
-        disparity_px = self.matcher(frame.left, frame.right)
+        if isinstance(self.matcher, Matcher):
+            disparity_px = self.matcher(frame.left, frame.right, frame.bands)
+        else:
+            disparity_px = self.matcher(frame.left, frame.right)
         if frame.blind is not None:
             disparity_px[frame.blind] = np.nan
         return disparity_px

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Interval
@@ -13,10 +15,14 @@ from annotated_types import Interval
 from jaxmap.errors import FrameError, UsageError
 from jaxmap.host.settings import NotNegative, count, options
 
-_SUBPIXELS = 16
+_SUBPIXELS, _UNKNOWN, _MULTIPLE = 16, -1, 16
+"""Of a disparity in OpenCV's integers; what is none; and how many are searched is a multiple of that."""
 _MOST_DISPARITIES, _MOST_PENALTY = 2032, 32_767
 """OpenCV keeps disparities, in sixteenths, and costs as 16-bit integers."""
-_OF_OPENCV = ("mode", "p1", "p2", "pad_left")
+OVERLAP_ROWS = 16
+"""Rows above a band that are matched with it: paths begin there, and blocks reach over its edges."""
+
+_OF_OPENCV = ("mode", "p1", "p2", "pad_left", "narrow")
 _OF_STEP = ("cost", "paths", "step_penalty", "jump_penalty", "soft", "temperature", "kernels")
 
 
@@ -85,6 +91,9 @@ class StereoOptions:
     """Edge of the square, odd, that is near."""
     pad_left: bool = True
     """Match the leftmost columns too."""
+    narrow: bool = True
+    """Mode 3way: search in each part of the image the disparities that small images show there, and no others: faster,
+    with fewer false matches."""
     near_guard: bool = True
     """Leave out what is too near for the disparities searched, instead of taking false matches there."""
 
@@ -128,6 +137,15 @@ class StereoOptions:
         return 16 * area if self.p1 is None else self.p1, 64 * area if self.p2 is None else self.p2
 
 
+class Band(NamedTuple):
+    """Rows of an image, `first` to before `end`, and how many disparities are searched in them, from `least_px` on."""
+
+    first: int
+    end: int
+    least_px: int
+    disparities: int
+
+
 class Matcher:
     """Matches rectified pairs; may be called from several threads at once."""
 
@@ -143,12 +161,27 @@ class Matcher:
             raise _bad(f"{self.num_disparities} disparities in images {width_px} px wide", "take fewer")
         self._local = threading.local()
 
-    def __call__(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    @property
+    def narrows(self) -> bool:
+        """Whether it is to be told what to search where: the paths of other modes run through the whole image."""
+        return self.options.narrow and self.options.mode == "3way"
+
+    def band(self, first: int, end: int, least_px: float = -math.inf, limit_px: float = math.inf) -> Band:
+        """Rows in which disparities from `least_px` to below `limit_px` are searched, as far as the options go."""
+        lowest = self.options.min_disparity_px
+        highest = lowest + self.num_disparities
+        from_px = math.floor(min(max(least_px, lowest), highest - _MULTIPLE))
+        count = -(-math.ceil(min(limit_px, highest) - from_px) // _MULTIPLE) * _MULTIPLE
+        count = min(max(count, _MULTIPLE), self.num_disparities)
+        return Band(first, end, min(from_px, highest - count), count)
+
+    def __call__(self, left: np.ndarray, right: np.ndarray, bands: Sequence[Band] = ()) -> np.ndarray:
         """Disparity of the left image.
 
         Args:
             left: rectified, uint8, (H, W) or (H, W, 3) RGB.
             right: likewise, of the same size.
+            bands: what to search in which rows, which together are all; by default everything everywhere.
 
         Returns:
             float32 (H, W) in px, a multiple of 1/16; NaN where the pixel has no match, failed the left-right
@@ -157,16 +190,41 @@ class Matcher:
         Raises:
             FrameError: the two images differ in size.
         """
+        import cv2
+
+        from jaxmap.matching.select import usual_speckle_px
+
         check_same_size(left, right)
         left, right = as_grey(left), as_grey(right)
-        pad = max(self.num_disparities + self.options.min_disparity_px, 0) if self.options.pad_left else 0
-        padded = (np.pad(image, ((0, 0), (pad, 0)), "edge") for image in (left, right))
-        found = self.engine(left.size).compute(*padded)[:, pad:]
-        # Counted from the least that is searched; OpenCV's own mark of the unknown is less than all.
-        sixteenths = found - np.int16(self.options.min_disparity_px * _SUBPIXELS)
+        # From here on in sixteenths, counted from the least that is searched; what is unknown is negative.
+        found = np.empty(left.shape, np.int16)
+        for band in bands or [self.band(0, len(left))]:
+            found[band.first : band.end] = self._searched(left, right, band)
+        speckle_px = self.options.speckle_window
+        if speckle_px is None:
+            speckle_px = usual_speckle_px(left.size)
+        if speckle_px:
+            cv2.filterSpeckles(found, _UNKNOWN, speckle_px, self.options.speckle_range_px * _SUBPIXELS)
         disparity_px = np.multiply(found, np.float32(1 / _SUBPIXELS), dtype=np.float32)
-        np.copyto(disparity_px, np.nan, where=(sixteenths < 0) | self._at_edges(sixteenths))
+        disparity_px += np.float32(self.options.min_disparity_px)
+        np.copyto(disparity_px, np.nan, where=(found < 0) | self._at_edges(found))
         return disparity_px
+
+    def _searched(self, left: np.ndarray, right: np.ndarray, band: Band) -> np.ndarray:
+        """The disparities of a band, in sixteenths, from the least of the options on."""
+        import cv2
+
+        above = min(OVERLAP_ROWS, band.first)
+        rows = slice(band.first - above, band.end + self.options.block_size // 2 + 1)
+        # OpenCV leaves out the columns whose match may lie left of the right image.
+        pad = max(band.disparities + band.least_px, 0) if self.options.pad_left else 0
+        padded = (cv2.copyMakeBorder(image[rows], 0, 0, pad, 0, cv2.BORDER_REPLICATE) for image in (left, right))
+        found = self.engine(band).compute(*padded)[above : above + band.end - band.first, pad:]
+        # OpenCV's own mark of the unknown is less than all that is searched.
+        unknown = found < band.least_px * _SUBPIXELS
+        found = found - np.int16(self.options.min_disparity_px * _SUBPIXELS)
+        found[unknown] = _UNKNOWN
+        return found
 
     def _at_edges(self, sixteenths: np.ndarray) -> np.ndarray:
         """Where a step of disparity is near; means nothing where disparity is unknown, which is negative."""
@@ -189,35 +247,33 @@ class Matcher:
         other_way = np.isfinite(self(right, left)).mean()
         return bool(other_way > 0.2 and other_way > 1.4 * valid)
 
-    def engine(self, image_px: int) -> Any:
-        """OpenCV's matcher of grey images of so many pixels; each thread has its own, which reuses its buffers."""
+    def engine(self, band: Band | None = None) -> Any:
+        """OpenCV's matcher of grey images, for the disparities of a band or for all; speckles are left to the caller.
+
+        Each thread has its own, which reuses its buffers.
+        """
         # Imported here, so that the command line can read the options without OpenCV and JAX.
         import cv2
 
-        from jaxmap.matching.select import usual_speckle_px
-
+        options = self.options
         if not hasattr(self._local, "engine"):
-            options, unchecked = self.options, self.options.left_right_max_diff_px < 0
             p1, p2 = options.penalties()
-            speckle_px = options.speckle_window
-            if speckle_px is None:
-                speckle_px = usual_speckle_px(image_px)
             mode = "SGBM_3WAY" if options.mode == "3way" else options.mode.upper()
             self._local.engine = cv2.StereoSGBM.create(
-                minDisparity=options.min_disparity_px,
-                numDisparities=self.num_disparities,
                 blockSize=options.block_size,
                 P1=p1,
                 P2=p2,
-                # OpenCV raises anything below 1 to 1, so a difference that never occurs turns the check off.
-                disp12MaxDiff=self.num_disparities + 1 if unchecked else options.left_right_max_diff_px,
                 preFilterCap=options.pre_filter_cap,
                 uniquenessRatio=options.uniqueness_ratio,
-                speckleWindowSize=speckle_px,
-                speckleRange=options.speckle_range_px,
                 mode=getattr(cv2, f"STEREO_SGBM_MODE_{mode}"),
             )
-        return self._local.engine
+        engine, band = self._local.engine, band or self.band(0, 0)
+        engine.setMinDisparity(band.least_px)
+        engine.setNumDisparities(band.disparities)
+        # OpenCV raises anything below 1 to 1, so a difference that never occurs turns the check off.
+        unchecked = options.left_right_max_diff_px < 0
+        engine.setDisp12MaxDiff(band.disparities + 1 if unchecked else options.left_right_max_diff_px)
+        return engine
 
 
 def check_same_size(left: np.ndarray, right: np.ndarray) -> None:

@@ -95,7 +95,7 @@ def measure(case: Case, budget_s: float) -> dict[str, Any]:
         What the JSON holds of a case: figures of our run, `peers` with theirs and the ratios, and `missing`, the peers
         that could not run, each with the modules that are not installed.
     """
-    missing = {peer.name: absent for peer in case.peers if (absent := [*filter(_is_absent, peer.modules)])}
+    missing = {peer.name: absent for peer in case.peers if (absent := [*filter(is_absent, peer.modules)])}
     peers = [peer for peer in case.peers if peer.name not in missing]
     runs = [case.run, *(peer.make() for peer in peers)]
     first_s = [_warmed_up(run) for run in runs]
@@ -160,7 +160,8 @@ def bound(limit: float, baseline_ratio: float | None) -> float:
     return min(limit, max(SLACK * baseline_ratio, FLOOR * limit))
 
 
-def _is_absent(module: str) -> bool:
+def is_absent(module: str) -> bool:
+    """Whether a module is not installed."""
     return importlib.util.find_spec(module) is None
 
 

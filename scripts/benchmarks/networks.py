@@ -4,7 +4,9 @@
 
 prints our network with the compiled kernel and without it beside onnxruntime, all three with the same weights and in
 turn: wall time, processor time, their ratios, and the greatest difference of the logits. Processor time of several
-threads counts those of onnxruntime that wait by spinning; with `--threads 1` nobody waits.
+threads counts those of onnxruntime that wait by spinning; with `--threads 1` nobody waits. It needs torch,
+segmentation_models_pytorch and onnx, which make the network and write it for onnxruntime, and that itself: all are in
+the extra `bench`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import PAUSE_S, Run, limit_threads
+from harness import PAUSE_S, Run, is_absent, limit_threads
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -163,6 +165,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=25)
     given = parser.parse_args()
+    if absent := [module for module in PEERS["onnxruntime"][1] if is_absent(module)]:
+        parser.error(f"not installed: {', '.join(absent)}; install jaxmap's extra `bench`")
     limit_threads(given.threads)
     images = np.random.default_rng(0).integers(0, 256, (1, *given.size, 3), np.uint8)
     session = onnx_session(given.backbone, images, given.threads)

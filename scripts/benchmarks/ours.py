@@ -31,7 +31,6 @@ from jaxmap.fusion.kernel import add_sighting
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.fusion.query import top_down
-from jaxmap.fusion.sensor_model import point_weights
 from jaxmap.geometry import cloud as geometry
 from jaxmap.geometry.grid import view_window, window_shape
 from jaxmap.geometry.plane import fit_plane_mlesac
@@ -172,7 +171,7 @@ def integrate_frame(scene: Scene, grid: GridSpec) -> Prepared:
 
 
 def fuse_frame(scene: Scene, size: str, add: Callable[..., Any] = add_sighting) -> Prepared:
-    """Carving and integration of one frame, as the step does them; the result is the map's tensor.
+    """Projection, carving and integration of one frame, as the step does them; the result is the map's tensor.
 
     Args:
         scene: the frame.
@@ -182,19 +181,16 @@ def fuse_frame(scene: Scene, size: str, add: Callable[..., Any] = add_sighting) 
     params, grid = make_fusion_params(ROVER_CLASSES), grid_of(size)
     empty = make_voxel_map(grid, ROVER_CLASSES)
     shape = window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1))
-    points = points_of(scene)
 
-    def fuse(log_odds: jax.Array, rest: VoxelMap, points: Points, columns: list[jax.Array], pose: jaxlie.SE3) -> Any:
-        cloud, voxel_map = points.cloud, replace(rest, log_odds=log_odds)
+    def fuse(
+        log_odds: jax.Array, rest: VoxelMap, disparity_px: jax.Array, labels: PointLabels, pose: jaxlie.SE3
+    ) -> Any:
         window = view_window(rest.grid, scene.camera, pose, DEPTH_RANGE_M[1], shape)
-        weights, points_world = point_weights(rest.grid, cloud, RULE), jnp.stack(columns, axis=-1)
-        sighting = Sighting(scene.camera, pose, points_world, points.labels, weights, None, cloud.depth_m, cloud.valid)
-        return add(voxel_map, sighting, window, params, RULE, DEPTH_RANGE_M)[0].log_odds
+        sighting = Sighting(scene.camera, pose, disparity_px, labels)
+        return add(replace(rest, log_odds=log_odds), sighting, window, params, RULE, DEPTH_RANGE_M)[0].log_odds
 
-    # By columns, as the step has them.
-    columns = [jnp.array(points.cloud.points_world[:, axis]) for axis in range(3)]
-    points = points._replace(cloud=points.cloud._replace(points_world=None))  # pyright: ignore[reportArgumentType]
-    return prepare_update(fuse, empty.log_odds, replace(empty, log_odds=None), points, columns, scene.pose)
+    seen = (jnp.asarray(scene.disparity_px), points_of(scene).labels, scene.pose)
+    return prepare_update(fuse, empty.log_odds, replace(empty, log_odds=None), *seen)
 
 
 @cache

@@ -103,14 +103,14 @@ class Run:
 
     def __init__(self, plan: Any, folder: Path) -> None:
         from jaxmap.mapping.step import compile_step
-        from jaxmap.stereo.match import Matcher, StereoOptions
+        from jaxmap.stereo.match import as_grey
 
         self.plan, self.folder, self.voxel_map = plan, folder, plan.mapper.init()
         self.mapper, self.cost = compile_step(plan.mapper, self.voxel_map, plan.frame_form, plan.params, plan.key)
+        self.showing = plan.mapper.step
         self.prepared = list(plan.prepare())
-        camera = plan.front_end.camera
-        self.sgbm = Matcher(StereoOptions(), camera.width_px).engine(camera.width_px * camera.height_px)
-        self.grey = [[_grey(image) for image in one.rectified[:2]] for one in self.prepared]
+        self.grey = [[as_grey(image) for image in one.rectified[:2]] for one in self.prepared]
+        self.sgbm = _sgbm(plan.front_end.matcher.options, *self.grey[0][0].shape)
 
     def indices(self, frames: int) -> list[int]:
         """So many frames, those of the sequence in turn."""
@@ -149,7 +149,9 @@ class Run:
         from jaxmap.mapping.sequence import FusedFrame
         from jaxmap.runs.folder import RunFolder, write_key_frame
         from jaxmap.runs.log import RunLog
+        from jaxmap.stereo.bands import search_bands
         from jaxmap.stereo.blank import blank_reason
+        from jaxmap.stereo.match import as_grey
         from jaxmap.types import to_device
 
         plan, prepared, log = self.plan, self.prepared[index], RunLog()
@@ -160,13 +162,18 @@ class Run:
             for image in pair:
                 blank_reason(image)
         with spent.stage("rectify"):
-            left, right = front_end.rectify(*pair)
+            left, right = front_end.rectify(pair.left, as_grey(pair.right))
         with spent.stage("SGBM alone"):
             self.sgbm.compute(*self.grey[index])
-        with spent.stage("match, all in"):
+        with spent.stage("match everything"):
             front_end.matcher(left, right)
-        with spent.stage("near guard"):
-            front_end.near_guard(left, right)
+        with spent.stage("small images"):
+            coarse = front_end.coarse(left, right)
+            if prepared.rectified.bands is not None:
+                search_bands(coarse, front_end.matcher, left.shape[0])
+        if prepared.rectified.bands is not None:
+            with spent.stage("match what they show"):
+                front_end.matcher(left, right, prepared.rectified.bands)
         with spent.stage("hand over"):
             to_device(as_rgb(left))
             to_device(as_rgb(right) if frame.disparity_px is None else frame.disparity_px)
@@ -177,8 +184,10 @@ class Run:
             log.add(FusedFrame(prepared, info))
         labels = None
         if plan.labeller.classes:
-            with spent.stage("labels of a key frame"):
-                labels = np.asarray(plan.mapper.label_image(frame, plan.params, plan.key, 1))
+            frame = replace(frame, show=to_device(True, np.bool_))
+            with spent.stage("step of a key frame"):
+                self.voxel_map, info = self.showing(self.voxel_map, frame, plan.params, plan.key)
+                labels = np.asarray(info.labels)
         folder = RunFolder(self.folder / "run")
         folder.pictures.mkdir(parents=True, exist_ok=True)
         matched = front_end.matched(prepared.rectified)
@@ -186,10 +195,15 @@ class Run:
             write_key_frame(folder, index, matched, labels, plan.labeller.classes, large=False)
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
-    import cv2
+def _sgbm(options: Any, height_px: int, width_px: int) -> Any:
+    """OpenCV's matcher, of all disparities, with its own removal of speckles."""
+    from jaxmap.matching.select import usual_speckle_px
+    from jaxmap.stereo.match import Matcher
 
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    sgbm = Matcher(options, width_px).engine()
+    sgbm.setSpeckleWindowSize(usual_speckle_px(height_px * width_px))
+    sgbm.setSpeckleRange(options.speckle_range_px)
+    return sgbm
 
 
 def _median(times: list[tuple[float, float]], column: int) -> float:

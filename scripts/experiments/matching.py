@@ -1,13 +1,13 @@
 """Semi-global matching in JAX beside OpenCV's modes at equal settings: what is matched, and how truly.
 
-    python scripts/experiments/matching.py [--matchers 3way sgbm hh census bt --p1 0.15 --p2 0.8 --frames 3]
+    python scripts/experiments/matching.py [--matchers 3way bands sgbm hh census bt --p1 0.15 --p2 0.8 --frames 3]
 
-Disparities searched, block, uniqueness, left-right check and speckles are the defaults of `StereoOptions` for all;
-edges of depth are kept. With truth (the Motorcycle pair; frames of simulated traverses with `gt/depth`): `matched`, the
-share of the pixels whose disparity is known that have one; of these, `off_1` and `off_3`, which err by more than 1 and
-3 px, and the median error; `bad_1` and `bad_3`, the same shares over all pixels, where a pixel without a match is a bad
-one. Without truth, of KITTI and K10 `agreeing`: points within 5 % of the depth measured five frames later. `ms` is time
-of the processor.
+`bands` is 3WAY as `jaxmap map` runs it (`stereo.narrow`). Disparities searched, block, uniqueness, left-right check and
+speckles are the defaults of `StereoOptions` for all; edges of depth are kept. With truth (the Motorcycle pair; frames of
+simulated traverses with `gt/depth`): `matched`, the share of the pixels whose disparity is known that have one; of
+these, `off_1` and `off_3`, which err by more than 1 and 3 px, and the median error; `bad_1` and `bad_3`, the same shares
+over all pixels, where a pixel without a match is a bad one. Without truth, of KITTI and K10 `agreeing`: points within
+5 % of the depth measured five frames later. `ms` is time of the processor.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from stereo_table import Simulated, Site, sites
 
 from jaxmap.matching.design import MatchDesign, make_match_params
 from jaxmap.matching.match import match
+from jaxmap.stereo.bands import search_bands
+from jaxmap.stereo.coarse import CoarseMatcher
 from jaxmap.stereo.match import Matcher, StereoOptions
 
 SCORES = ("matched", "off_1", "off_3", "median_px", "bad_1", "bad_3", "agreeing")
@@ -36,6 +38,13 @@ matched = jax.jit(match, static_argnums=0)
 def opencv(mode: str, width_px: int) -> Match:
     """OpenCV's matcher in that mode."""
     return Matcher(StereoOptions(mode=mode, edge_step_px=0), width_px)
+
+
+def in_bands(width_px: int) -> Match:
+    """OpenCV's 3WAY as `jaxmap map` runs it: in bands, of the disparities that small images show there."""
+    matcher = Matcher(StereoOptions(edge_step_px=0), width_px)
+    coarse = CoarseMatcher(matcher, width_px)
+    return lambda left, right: matcher(left, right, search_bands(coarse(left, right), matcher, len(left)))
 
 
 def ours(kind: str, width_px: int, p1: float | None, p2: float | None) -> Match:
@@ -87,7 +96,7 @@ def main() -> None:
     """Prints one table."""
     parser = command_line(__doc__)
     parser.add_argument("--data", type=Path, default=SHARED)
-    parser.add_argument("--matchers", nargs="+", default=["3way", "sgbm", "hh", "census", "bt"])
+    parser.add_argument("--matchers", nargs="+", default=["3way", "bands", "sgbm", "hh", "census", "bt"])
     parser.add_argument("--p1", nargs="+", type=float, default=[None])
     parser.add_argument("--p2", nargs="+", type=float, default=[None])
     parser.add_argument("--frames", type=int, default=3, help="of each traverse, of those with a true depth")
@@ -102,8 +111,9 @@ def main() -> None:
         if isinstance(site, Simulated):
             site.chosen = site.chosen[:: max(len(site.chosen) // given.frames, 1)][: given.frames]
         for kind in given.matchers:
-            if kind in ("3way", "sgbm", "hh", "hh4"):
-                choices = [(None, None, opencv(kind, site.front_end.camera.width_px))]
+            if kind in ("3way", "bands", "sgbm", "hh", "hh4"):
+                width_px = site.front_end.camera.width_px
+                choices = [(None, None, in_bands(width_px) if kind == "bands" else opencv(kind, width_px))]
             else:
                 width_px = site.front_end.camera.width_px
                 choices = [(p1, p2, ours(kind, width_px, p1, p2)) for p1, p2 in product(given.p1, given.p2)]

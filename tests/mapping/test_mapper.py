@@ -106,6 +106,33 @@ def test_the_whole_step_equals_the_twin(mappers, frame, name):
     assert voxel_map.frames_fused == 1
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_frame_shows_its_labels_where_it_asks_for_them(soft):
+    mapper = make_mapper(CAMERA, GRID, make_files_labeller(CLASSES, soft=soft), RULES["own"], DEPTH_RANGE_M)
+    frame = an_example_frame(0)
+    if soft:
+        shares = np.random.default_rng(1).dirichlet(np.ones(4), (HEIGHT_PX, WIDTH_PX))[..., : len(CLASSES)]
+        frame = replace(frame, labels=None, class_probabilities=jnp.asarray(shares, jnp.float32))
+    fused, info = mapper.step(mapper.init(), frame, PARAMS, KEY)
+    assert info.labels is None
+    labels = np.asarray(mapper.label_image(frame, PARAMS, KEY, 0))
+    assert len(np.unique(labels)) > 2
+    for show in (False, True):
+        with_labels, info = mapper.step(mapper.init(), replace(frame, show=jnp.asarray(show)), PARAMS, KEY)
+        np.testing.assert_array_equal(info.labels, labels if show else 0)
+        assert_maps_equal(with_labels, fused)
+    assert mapper.compilations() == 2
+
+
+@pytest.mark.slow
+def test_what_is_drawn_for_a_frame_is_shown(plane_mapper):
+    frame, voxel_map = replace(unlabelled(an_example_frame(0)), show=jnp.asarray(True)), plane_mapper.init()
+    for number in range(2):
+        voxel_map, info = plane_mapper.step(voxel_map, frame, PLANE_PARAMS, KEY)
+        np.testing.assert_array_equal(info.labels, plane_mapper.label_image(frame, PLANE_PARAMS, KEY, number))
+
+
 def test_background_stays_a_class_of_the_image_and_makes_no_voxels(mappers):
     frame, mapper = an_example_frame(0), mappers["own"]
     sky = replace(frame, labels=jnp.zeros_like(frame.labels))
