@@ -117,6 +117,13 @@ def test_a_baseline_in_another_unit_is_told(folder, baseline, option):
     assert found.stops and option in found.fix
 
 
+@pytest.mark.parametrize("size", [2.0, 0.5])
+def test_a_calibration_of_images_of_another_size_is_told(folder, size):
+    scaled = {name: size * CAMERA[name] for name in ("fx_px", "cx_px", "cy_px")}
+    (folder / "camera.yaml").write_text(yaml.safe_dump(CAMERA | scaled))
+    assert "principal-point" in kinds(checked(folder))
+
+
 def test_what_is_nearer_than_searched_is_told(folder):
     wall = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(HEIGHT_PX, WIDTH_PX + 40)), (0, 0), 1.2)
     wall = cv2.normalize(wall, None, 0, 255, cv2.NORM_MINMAX)
