@@ -22,6 +22,7 @@ from jaxmap.checks.motions import (
     shrunk_camera,
 )
 from jaxmap.checks.scale import scale_findings, still_findings
+from jaxmap.checks.tilt import tilt_findings
 from jaxmap.datasets.base import StereoSequence
 from jaxmap.datasets.options import PosesAre
 from jaxmap.datasets.pose_axes import (
@@ -177,7 +178,9 @@ def pose_convention(
     far_better = used.off_deg > max(SUSPECT_DEG, FAR_BETTER * best_deg)
     if used.off_deg < FITS_DEG and used.up > UPRIGHT and not far_better:
         mounting = mounting_findings(used.T_source_camera, told, reading)
-        return [*mounting, *scale_findings(used.T_source_camera, told, baseline_m)]
+        # A camera that is turned on its body sees the ground askew, too.
+        tilt = [] if mounting else tilt_findings(used.T_source_camera, up_camera_measured, used.reading)
+        return [*mounting, *tilt, *scale_findings(used.T_source_camera, told, baseline_m)]
     if not fitting:
         return _disagreement(used, told)
     best = fitting[0]

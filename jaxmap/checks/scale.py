@@ -11,12 +11,14 @@ from jaxmap.checks.finding import Finding
 from jaxmap.checks.motions import Motion
 
 SCALE_FITS, SCALE_STOPS = 1.1, 1.5
-"""Steps whose lengths differ by less fit: by right calibrations and poses they differ by 1.02 at most. By more than the
-second, the map would be wrong."""
+"""Steps whose lengths differ by less fit: with right calibrations and poses they differed by 1.03 at most. By more than
+the second, the map would be wrong."""
 
-SURE_AT, SURE_STEPS = 1.35, 3
-"""A difference below the first may be noise of the poses, unless so many steps show it. Quartiles that lie farther
-apart than that, or than the difference itself, tell of the clock or of tracking, not of a scale."""
+ENOUGH_STEPS, FEW_FIT = 3, 2.0
+"""Fewer steps than the first tell a difference above the second alone: a smaller one may be noise."""
+
+SCATTER = 1.35
+"""Quartiles that lie farther apart, or farther than the difference itself, tell of the clock or of tracking."""
 
 STILL = 0.05
 """Poses whose steps are shorter than this share of those that images show stand still."""
@@ -44,11 +46,11 @@ def scale_findings(
         return []
     low, factor, high = np.quantile(by_images_m[moved] / by_poses_m[moved], (0.25, 0.5, 0.75))
     count, size = int(moved.sum()), max(factor, 1 / factor)
-    if max(low, 1 / high) < SCALE_FITS or high > min(size, SURE_AT) * low:
+    if max(low, 1 / high) < SCALE_FITS or high > min(size, SCATTER) * low:
         return []
-    if size < SURE_AT and count < SURE_STEPS:
+    if count < ENOUGH_STEPS and size < FEW_FIT:
         return []
-    unit = next((name for unit_size, name in UNITS.items() if 1 / SURE_AT < size / unit_size < SURE_AT), None)
+    unit = next((name for unit_size, name in UNITS.items() if 1 / SCATTER < size / unit_size < SCATTER), None)
     by_images = "by the images" if baseline_m is None else f"by the images, with a baseline of {baseline_m:.3g} m,"
     what = f"steps are {factor:,.4g} times as long {by_images} as by the poses"
     if unit is None:

@@ -27,7 +27,7 @@ from jaxmap.datasets.images import (
     sequence_bits,
 )
 from jaxmap.datasets.options import Bits, ReadOptions
-from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE, PoseReading, stand_upright, to_z_up
+from jaxmap.datasets.pose_axes import PoseReading, found_world, stand_upright, to_z_up
 from jaxmap.datasets.poses import (
     FEW_FRAMES,
     PoseTrack,
@@ -276,11 +276,12 @@ def assemble(
     mounted = options.poses is None or options.pose_convention in ("body", "frd")
     if mounted and options.calibration is not None and options.calibration.suffix.lower() != ".mat":
         T_source_camera = T_source_camera @ read_mounting(options.calibration)
-    T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
+    world = found_world(T_source_camera, options.poses_world)
+    T_world_camera, T_world_source = to_z_up(T_source_camera, world, options.poses_up)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
 
     all_notes += [*track.notes, *track.faults]
-    if options.poses_world == "auto" and not np.array_equal(T_world_source, np.eye(4)):
+    if options.poses_world == "auto" and world != "z_up":
         all_notes.append("the poses' world is taken for camera-like (y down) and turned z-up")
     if len(kept) < len(selected):
         all_notes.append(
@@ -296,9 +297,7 @@ def assemble(
         crs=options.crs or crs,
         notes=tuple(all_notes),
         pose_faults=track.faults,
-        pose_reading=reading_of(options, track)._replace(
-            poses_world=next(name for name, T in T_Z_UP_SOURCE.items() if np.array_equal(T, T_world_source))
-        ),
+        pose_reading=reading_of(options, track)._replace(poses_world=world),
         **common,
     )
 

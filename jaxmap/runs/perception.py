@@ -223,7 +223,7 @@ def _with_poses(observations: Observations, config: PerceiveConfig, notify: Noti
         raise JaxmapError(
             f"none of {len(timestamps_s)} frames has a pose", where=config.poses, fix="check that both use one clock"
         )
-    T_world_camera, _ = to_z_up(T_source_camera[has_pose], config.poses_world)
+    T_world_camera, _ = to_z_up(T_source_camera[has_pose], config.poses_world, config.poses_up)
     T_world_camera[:, :3, 3] -= np.array(observations.attributes.site_origin)
     kept = observations.selected(np.flatnonzero(has_pose))
     away_m = float(np.median(np.linalg.norm((T_world_camera - kept.T_world_camera)[:, :3, 3], axis=1)))
