@@ -1,4 +1,4 @@
-"""Whether the numbers of a calibration can be those of these images: baseline and principal point."""
+"""Whether the numbers of a calibration can be those of these images: baseline, principal point, distortion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def calibration_findings(given: StereoCamera | StereoRig, camera: StereoCamera) 
         given: as it was given.
         camera: rectified.
     """
-    return [*_baseline(camera), *_principal_point(given)]
+    return [*_baseline(camera), *_principal_point(given), *_distortion(given)]
 
 
 def _principal_point(camera: StereoCamera | StereoRig) -> list[Finding]:
@@ -37,6 +37,17 @@ def _principal_point(camera: StereoCamera | StereoRig) -> list[Finding]:
     what = f"the principal point lies at {x:.2f} of the width of the images and {y:.2f} of their height, off the middle"
     fix = "give the calibration of images of this size; if these are cut out of larger ones, all is well"
     return [Finding("principal-point", False, 0.8, what, fix)]
+
+
+def _distortion(camera: StereoCamera | StereoRig) -> list[Finding]:
+    """Lenses that do not bend: simulated ones, whose cameras are exactly parallel, or their distortion is lost."""
+    if not isinstance(camera, StereoRig) or np.array_equal(camera.R_right_left, np.eye(3)):
+        return []
+    if camera.distortion_left.any() or camera.distortion_right.any():
+        return []
+    what = "the calibration of these raw images has no distortion, which lenses have; a map of bent images is bent"
+    fix = "give the distortion of both cameras; if it was taken out of the images, all is well"
+    return [Finding("no-distortion", False, 0.6, what, fix)]
 
 
 def _baseline(camera: StereoCamera) -> list[Finding]:
