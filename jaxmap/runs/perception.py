@@ -36,6 +36,7 @@ from jaxmap.runs.labelling import (
     choose_model,
     describe_network,
     network_size_px,
+    warn_of_masks,
 )
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.types import StereoCamera, pinhole
@@ -136,6 +137,8 @@ def plan_perception(
     if not source.startswith(SAMPLE_PREFIX) or config.poses or config.calibration:
         findings = warn_of_faults(sequence, front_end, strict=config.strict, notify=notify)
     label_folder = choose_label_folder(config, sequence)
+    if label_folder is not None:
+        warn_of_masks(label_folder, sequence, notify)
     model, network = choose_model(config)
     with as_usage_error():
         soft = None if label_folder is None else label_folder.soft

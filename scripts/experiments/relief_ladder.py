@@ -58,11 +58,10 @@ def main() -> None:
     for path in given.traverses or [path for path in DEFAULT if str(path) == DEFAULT[0] or Path(path).exists()]:
         traverse = Traverse(path)
         for matcher in given.matchers:
-            for name, config in sources(traverse, given.model).items():
-                if given.labels and name not in given.labels:
-                    continue
+            known = sources(traverse, given.model)
+            for name in given.labels or known:
                 frames = Frames(traverse.sequence, traverse.truth)
-                result = frames.scored(replace(config, stereo=MATCHERS[matcher], stop=given.stop))
+                result = frames.scored(replace(known[name], stereo=MATCHERS[matcher], stop=given.stop))
                 ious = result.lattice_ious()
                 numbers = [result.scores[one] or 0.0 for one in scores]
                 table.row(traverse.name, matcher, name, *numbers, float(np.mean(ious)), min(ious), max(ious))
