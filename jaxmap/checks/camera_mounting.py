@@ -12,8 +12,11 @@ from jaxmap.checks.finding import Finding
 from jaxmap.checks.motions import Motion, between_deg
 from jaxmap.datasets.pose_axes import PoseReading, rigid_inverse
 
-TURNED_DEG, STOPS_DEG = 8.0, 12.0
+TURNED_DEG, STOPS_DEG = 5.0, 12.0
 """Cameras turned by less are told by `jaxmap refine`; by more than the second, the map would be wrong."""
+
+DIRECTIONS = 3
+"""Fewer directions of steps and turns agree after some turn by chance."""
 
 AGREE_DEG = 4.0
 """Steps agree to this after the turn, or it is not a turn that is amiss."""
@@ -29,11 +32,11 @@ def mounting_findings(
 
     Args:
         T_world_camera: the poses as read; any world.
-        motions: measured between frames, at least two that tell.
+        motions: measured between frames.
         reading: the conventions that the poses were read by.
     """
     by_poses, by_images = _directions(T_world_camera, motions)
-    if len(by_poses) < 2:
+    if len(by_poses) < DIRECTIONS:
         return []
     before_deg = float(np.median(between_deg(by_poses, by_images)))
     weights = [1.0] * len(by_poses) + [PRIOR] * 3
@@ -51,7 +54,10 @@ def mounting_findings(
     if reading.pose_convention in ("body", "frd"):
         fix = f"give the camera's place on the body in the calibration file, turned so: {turn}"
     else:
-        fix = f"give poses of the left camera itself; poses of the sequence's own can be turned in camera.yaml: {turn}"
+        fix = (
+            "give poses of the left camera itself, or check the principal point of the calibration; poses of the "
+            f"sequence's own can be turned in camera.yaml: {turn}"
+        )
     certain = len(by_poses) / (len(by_poses) + 1)
     return [Finding("camera-mounting", turned_deg > STOPS_DEG, round(certain, 2), what, fix)]
 

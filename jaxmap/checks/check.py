@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmap.checks.calibration import calibration_findings
 from jaxmap.checks.clock import clock_findings
 from jaxmap.checks.finding import Finding
 from jaxmap.checks.images import image_findings
@@ -36,7 +37,7 @@ class Extent(NamedTuple):
     clock: bool
 
 
-THOROUGH, QUICK = Extent(6, 1024, steps=6, clock=True), Extent(3, 512, steps=2, clock=False)
+THOROUGH, QUICK = Extent(6, 1024, steps=6, clock=True), Extent(3, 512, steps=3, clock=False)
 """Some 5 to 10 s, and 1 s or less, for images of 1024 columns on two cores."""
 
 _UNMEASURABLE = {"swapped-images", "rows-disagree", "vertical-disparity"}
@@ -64,7 +65,8 @@ def check_sequence(sequence: StereoSequence, front_end: StereoFrontEnd, extent: 
     """
     started_s = time.perf_counter()
     samples = _samples(sequence, front_end, extent)
-    findings = [*image_findings(samples), *pair_findings(samples, front_end)]
+    findings = [*calibration_findings(sequence.camera, front_end.camera), *image_findings(samples)]
+    findings += pair_findings(samples, front_end)
     # Motions are measured by disparities: where these are wrong, only what the poses themselves say is looked at.
     measurable = not {finding.kind for finding in findings} & _UNMEASURABLE
     findings += pose_findings(sequence, front_end, extent.steps if measurable else 0)

@@ -1,4 +1,4 @@
-"""Whether left and right images fit the calibration: rows, order, the nearest and farthest depth, the baseline."""
+"""Whether left and right images fit the calibration: rows, order, the nearest and farthest depth."""
 
 from __future__ import annotations
 
@@ -22,26 +22,18 @@ HARDLY_ANY = 5
 NEAR_SHARE, NEAR_MATCHES, NEAR_STOPS_SHARE = 0.02, 8, 0.1
 """Matches nearer than the disparities reach that are worth a word, and those that leave a hole in the map."""
 
-BASELINES_M = (0.005, 3.0)
-"""Stereo rigs of rovers and cars have 0.02 to 1.5 m."""
-
-UNITS_M = {"mm": 1e-3, "cm": 1e-2}
-USUAL_BASELINES_M = (0.02, 1.5)
-
 
 def pair_findings(samples: Samples, front_end: StereoFrontEnd) -> list[Finding]:
     """Findings on what the two cameras see of one scene."""
     camera, alignment = front_end.camera, samples.alignment
-    baseline = _baseline(camera)
     if alignment is None:
-        return baseline + (_no_matches(samples) if samples.pairs else [])
+        return _no_matches(samples) if samples.pairs else []
     disparity_px = alignment.disparity_px[alignment.inliers]
     certain = _certainty(alignment)
     if np.median(disparity_px) < 0 and alignment.inliers.mean() > AGREE_SHARE:
         what = f"left and right look swapped: {np.mean(disparity_px < 0):.0%} of the matches have a negative disparity"
-        return [*baseline, Finding("swapped-images", True, certain, what, "swap the two folders or cameras")]
-    rows = _rows(camera, alignment, certain)
-    return [*baseline, *rows, *_near_limit(front_end, alignment, certain)]
+        return [Finding("swapped-images", True, certain, what, "swap the two folders or cameras")]
+    return [*_rows(camera, alignment, certain), *_near_limit(front_end, alignment, certain)]
 
 
 def _certainty(alignment: Alignment) -> float:
@@ -103,22 +95,3 @@ def _near_limit(front_end: StereoFrontEnd, alignment: Alignment, certain: float)
     )
     fix = f"--stereo.num-disparities {needed}"
     return [Finding("near-limit", share > NEAR_STOPS_SHARE, certain, what, fix)]
-
-
-def _baseline(camera: StereoCamera) -> list[Finding]:
-    """A baseline that no rig has."""
-    baseline_m = float(camera.baseline_m)
-    if BASELINES_M[0] <= baseline_m <= BASELINES_M[1]:
-        return []
-    least, most = USUAL_BASELINES_M
-    units = [unit for unit, metres in UNITS_M.items() if least <= baseline_m * metres <= most]
-    what = f"the baseline is {baseline_m:g} m, and no rover's cameras stand so far apart"
-    if baseline_m < 1:
-        what = f"the baseline is {1e3 * baseline_m:g} mm, and no two cameras stand so close together"
-    fix = "give the baseline in metres in the calibration"
-    if units:
-        options = " or ".join(f"--baseline-unit {unit}" for unit in units)
-        fix += f"; if it is {baseline_m * UNITS_M[units[0]]:g} m: {options.split(' or ')[0]}"
-        if len(units) > 1:
-            fix += f" (or {options.split(' or ')[1]})"
-    return [Finding("baseline-unit", True, 0.95, what, fix)]

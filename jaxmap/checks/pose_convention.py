@@ -21,6 +21,8 @@ from jaxmap.checks.motions import (
     read_shrunk,
     shrunk_camera,
 )
+from jaxmap.checks.scale import scale_findings, still_findings
+from jaxmap.checks.tilt import tilt_findings
 from jaxmap.datasets.base import StereoSequence
 from jaxmap.datasets.options import PosesAre
 from jaxmap.datasets.pose_axes import (
@@ -48,15 +50,11 @@ UPRIGHT, CLEARLY_UPRIGHT = 0.5, 0.7
 """Cosine between the world's up and that of the images. Above the second the images' upright alone is believed: the
 plane that was measured may be a wall."""
 
+SURE_MOTIONS = 4
+"""So many motions that fit no convention make the map wrong; fewer may be wrong themselves."""
+
 STEEP = 0.7
 """Share of the path that is climbed or fallen, on one that no rover drives."""
-
-SCALE_FITS, SCALE_STOPS = 1.35, 2.0
-"""Steps whose lengths differ by less fit; by more than the second, the map would be wrong."""
-
-UNITS = {1000.0: "mm", 100.0: "cm"}
-LONGEST_BASELINE_M = 3.0
-"""No stereo rig of a rover or a car is longer."""
 
 _WORDS = {
     "pose_convention": {
@@ -170,6 +168,8 @@ def pose_convention(
     told = [motion for motion in motions if motion.steps or motion.turns]
     fits = _fits(reading, T_file, told, up_camera_measured)
     used = next(fit for fit in fits if not fit.changes)
+    if used.off_deg > FITS_DEG and (still := still_findings(used.T_source_camera, told)):
+        return still
     # Noise alone must not make another reading look better.
     limit_deg = FITS_DEG if used.off_deg < FITS_DEG else min(FITS_DEG, used.off_deg / 2)
     fitting = [fit for fit in fits if fit.changes and fit.off_deg < limit_deg and fit.up > UPRIGHT]
@@ -178,7 +178,9 @@ def pose_convention(
     far_better = used.off_deg > max(SUSPECT_DEG, FAR_BETTER * best_deg)
     if used.off_deg < FITS_DEG and used.up > UPRIGHT and not far_better:
         mounting = mounting_findings(used.T_source_camera, told, reading)
-        return [*mounting, *_scale_findings(used, told, baseline_m)]
+        # A camera that is turned on its body sees the ground askew, too.
+        tilt = [] if mounting else tilt_findings(used.T_source_camera, up_camera_measured, used.reading)
+        return [*mounting, *tilt, *scale_findings(used.T_source_camera, told, baseline_m)]
     if not fitting:
         return _disagreement(used, told)
     best = fitting[0]
@@ -191,7 +193,7 @@ def pose_convention(
     fix = " or ".join([_options(reading, best.reading), *(_options(reading, rival.reading) for rival in rivals[:2])])
     found = Finding("pose-convention", True, round(float(np.clip(certain, 0.3, 0.99)), 2), what, fix)
     mounting = mounting_findings(best.T_source_camera, told, best.reading)
-    return [found, *mounting, *_scale_findings(best, told, baseline_m)]
+    return [found, *mounting, *scale_findings(best.T_source_camera, told, baseline_m)]
 
 
 def _changed(used: PoseReading, other: PoseReading) -> list[str]:
@@ -269,37 +271,10 @@ def _misfit(used: _Fit, motions: Sequence[Motion], best: _Fit | None = None) -> 
 
 
 def _disagreement(used: _Fit, motions: Sequence[Motion]) -> list[Finding]:
-    """No convention mends the poses: they are of other frames, or of another clock."""
+    """No convention mends the poses: they are of other frames, or of another clock, or the calibration is off."""
+    if 0 < len(motions) <= 2:
+        return []
     what = f"the poses do not fit the images, by no convention: {_misfit(used, motions)}"
-    fix = "check that poses and images are of one drive and one clock, and whether frames are left out"
+    fix = "check that poses and images are of one drive and one clock, that no frames are left out, and the calibration"
     certain = 0.6 * len(motions) / (len(motions) + 2)
-    return [Finding("poses-disagree", False, round(certain, 2), what, fix)] if len(motions) > 2 or not motions else []
-
-
-def _scale_findings(fit: _Fit, motions: Sequence[Motion], baseline_m: float | None) -> list[Finding]:
-    """Whether steps are as long as the images show."""
-    factors = []
-    for motion in motions:
-        step_m = np.linalg.norm(fit.T_source_camera[motion.j, :3, 3] - fit.T_source_camera[motion.i, :3, 3])
-        if motion.steps and step_m > 0:
-            factors.append(float(np.linalg.norm(motion.T_i_j[:3, 3]) / step_m))
-    if not factors:
-        return []
-    low, factor, high = np.quantile(factors, (0.25, 0.5, 0.75))
-    size = max(factor, 1 / factor)
-    # Where lengths scatter, it is the clock or the tracking, not the unit.
-    if size < SCALE_FITS or high > SCALE_FITS * low:
-        return []
-    unit = next((unit for unit_size, unit in UNITS.items() if 1 / SCALE_FITS < size / unit_size < SCALE_FITS), None)
-    long_baseline = baseline_m is not None and baseline_m > LONGEST_BASELINE_M
-    by_images = "by the images" if baseline_m is None else f"by the images, with a baseline of {baseline_m:.3g} m,"
-    what = f"steps are {factor:,.4g} times as long {by_images} as by the poses"
-    if unit is None:
-        fix = "check the baseline and the unit of the poses; poses of a single camera have no scale of their own"
-    elif factor > 1:
-        fix = f"--baseline-unit {unit}" if long_baseline else "check --poses-unit: the positions are too small"
-    else:
-        fix = f"--poses-unit {unit}"
-    # One step tells a unit; a scale that is off by less needs several.
-    certain = (len(factors) + 1) / (len(factors) + 1.5) if size > 10 else len(factors) / (len(factors) + 1)
-    return [Finding("scale", bool(size > SCALE_STOPS), round(certain, 2), what, fix)]
+    return [Finding("poses-disagree", len(motions) >= SURE_MOTIONS, round(certain, 2), what, fix)]

@@ -16,6 +16,7 @@ from jaxmap.commands.console import Console, check_bounds, parse
 from jaxmap.datasets.options import (
     BagOptions,
     LengthUnit,
+    Offset,
     PoseConvention,
     PosesAre,
     PosesWorld,
@@ -75,6 +76,8 @@ class RefineArguments:
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
     poses_world: PosesWorld = "auto"
     """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
+    poses_up: tuple[Offset, Offset, Offset] | None = None
+    """Direction of up in that world, where it is not level, see jaxmap map --help."""
     pose_convention: PoseConvention = "auto"
     """Axes that the poses describe, see jaxmap map --help."""
     poses_are: PosesAre = "T_world_camera"
@@ -135,6 +138,7 @@ def main(words: Sequence[str]) -> int:
         dataset=arguments.dataset,
         poses=arguments.poses,
         poses_world=arguments.poses_world,
+        poses_up=arguments.poses_up,
         pose_convention=arguments.pose_convention,
         poses_are=arguments.poses_are,
         quaternion=arguments.quaternion,

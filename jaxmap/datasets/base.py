@@ -27,8 +27,9 @@ from jaxmap.datasets.images import (
     sequence_bits,
 )
 from jaxmap.datasets.options import Bits, ReadOptions
-from jaxmap.datasets.pose_axes import T_Z_UP_SOURCE, PoseReading, stand_upright, to_z_up
+from jaxmap.datasets.pose_axes import PoseReading, found_world, stand_upright, to_z_up
 from jaxmap.datasets.poses import (
+    FEW_FRAMES,
     PoseTrack,
     in_unit_of_frames,
     make_pose_track,
@@ -38,7 +39,7 @@ from jaxmap.datasets.poses import (
     with_timestamps,
     without_wild_poses,
 )
-from jaxmap.datasets.units import METRES, with_baseline_unit
+from jaxmap.datasets.units import METRES, PER_SECOND, UNIT_NAMES, with_baseline_unit
 from jaxmap.errors import FrameError, JaxmapError
 from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
@@ -268,17 +269,19 @@ def assemble(
     kept = selected[has_pose[selected]]
     if not len(kept):
         raise _no_pose(timestamps_s[selected], track, options)
+    _check_time_units(timestamps_s, track, float(has_pose.mean()))
     T_source_camera = T_source_child[has_pose]
     if T_child_camera is not None:
         T_source_camera = T_source_camera @ (T_child_camera if T_child_camera.ndim == 2 else T_child_camera[has_pose])
     mounted = options.poses is None or options.pose_convention in ("body", "frd")
     if mounted and options.calibration is not None and options.calibration.suffix.lower() != ".mat":
         T_source_camera = T_source_camera @ read_mounting(options.calibration)
-    T_world_camera, T_world_source = to_z_up(T_source_camera, options.poses_world)
+    world = found_world(T_source_camera, options.poses_world)
+    T_world_camera, T_world_source = to_z_up(T_source_camera, world, options.poses_up)
     T_world_camera, site_origin = split_site_origin(T_world_camera)
 
     all_notes += [*track.notes, *track.faults]
-    if options.poses_world == "auto" and not np.array_equal(T_world_source, np.eye(4)):
+    if options.poses_world == "auto" and world != "z_up":
         all_notes.append("the poses' world is taken for camera-like (y down) and turned z-up")
     if len(kept) < len(selected):
         all_notes.append(
@@ -294,9 +297,7 @@ def assemble(
         crs=options.crs or crs,
         notes=tuple(all_notes),
         pose_faults=track.faults,
-        pose_reading=reading_of(options, track)._replace(
-            poses_world=next(name for name, T in T_Z_UP_SOURCE.items() if np.array_equal(T, T_world_source))
-        ),
+        pose_reading=reading_of(options, track)._replace(poses_world=world),
         **common,
     )
 
@@ -381,6 +382,20 @@ def _no_pose(timestamps_s: np.ndarray, track: PoseTrack, options: ReadOptions) -
         where=track.where,
         fix=fix,
     )
+
+
+def _check_time_units(timestamps_s: np.ndarray, track: PoseTrack, posed: float) -> None:
+    """Refuses times of frames in another unit than those of the poses: only the first, at zero, would be mapped."""
+    assert track.timestamps_s is not None
+    frames_s, poses_s = np.ptp(timestamps_s), np.ptp(track.timestamps_s)
+    for unit, per_second in PER_SECOND.items():
+        if posed < FEW_FRAMES and per_second > 1 and 0.5 < frames_s / max(poses_s, 1e-9) / per_second < 2:
+            raise JaxmapError(
+                f"times of the frames look like {UNIT_NAMES[unit]}, so that {posed:.0%} of the frames have a pose: "
+                f"the frames span {_span(timestamps_s)}, the poses {_span(track.timestamps_s)}",
+                where=track.where,
+                fix="give the times of the frames in seconds, in times.txt, or both in one unit",
+            )
 
 
 def _span(timestamps_s: np.ndarray) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -50,6 +51,17 @@ class LabelFolder:
         if self.labels_are == "raw":
             labels = self.rectify(ref, labels) if self.rectify else front_end.rectify_labels(labels)
         return {"class_probabilities" if self.soft else "labels": labels}
+
+    def looks_binary(self, names: Sequence[str]) -> bool:
+        """Whether the labels of these frames are 0 and 255 alone, as a black and white mask has them.
+
+        As labels, these are the first class and none. What cannot be read is passed over.
+        """
+        values: set[int] = set()
+        for path in () if self.soft else (find_mask(self.folder, name) for name in names):
+            with suppress(FrameError):
+                values |= set() if path is None else set(np.unique(read_values(path)).tolist())
+        return values == {0, IGNORE}
 
     def _read_indices(self, name: str) -> np.ndarray:
         path = find_mask(self.folder, name)

@@ -72,6 +72,9 @@ class ReadOptions:
     """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
     poses_world: PosesWorld = "auto"
     """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
+    poses_up: tuple[Offset, Offset, Offset] | None = None
+    """Direction of up in that world, where it is not level, as a SLAM's that begins at a camera which looks down;
+    jaxmap check measures it."""
     pose_convention: PoseConvention = "auto"
     """Axes that the poses describe: of the camera (optical: x right, y down, z forward), of a body at the camera's
     place (body: x forward, y left, z up; frd: x forward, y right, z down), of OpenGL (x right, y up, z backward), or

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.options import PosesAre, PosesWorld
+from jaxmap.errors import UsageError
 
 Axes = Literal["optical", "body", "frd", "opengl"]
 World = Literal["z_up", "z_down", "y_up", "camera"]
@@ -44,6 +45,8 @@ T_Z_UP_SOURCE: dict[World, np.ndarray] = {
 """Each kind of world turned z-up: north, east, down becomes east, north, up; where y is up or down, x stays x and
 forward (-z or z) becomes y."""
 
+MAX_LOCAL_RANGE_M = 10_000.0
+"""Smaller coordinates need no site origin: float32 resolves 1 mm there."""
 
 UPRIGHT = 0.8
 """Cosine of the angle between the cameras' mean up axis and a world's up axis that is clear; 37 degrees."""
@@ -99,15 +102,44 @@ def stand_upright(T: Float64[np.ndarray, "N 4 4"]) -> bool:
     return bool(-T[:, 2, 1].mean() > UPRIGHT)
 
 
+def found_world(T: Float64[np.ndarray, "N 4 4"], world: PosesWorld) -> World:
+    """The world of camera poses as it is given; or `auto`.
+
+    That takes it for a camera world (KITTI's) if the mean of the cameras' up axes (-y) points clearly along its -y,
+    else for z-up.
+    """
+    if world != "auto":
+        return world
+    up_world = -T[:, :3, 1].mean(axis=0)
+    return "camera" if -up_world[1] > UPRIGHT and -up_world[1] > abs(up_world[2]) else "z_up"
+
+
 def to_z_up(
-    T: Float64[np.ndarray, "N 4 4"], world: PosesWorld
+    T: Float64[np.ndarray, "N 4 4"], world: PosesWorld, up: tuple[float, float, float] | None = None
 ) -> tuple[Float64[np.ndarray, "N 4 4"], Float64[np.ndarray, "4 4"]]:
     """Camera poses in a z-up world, and the transform from their own world into it.
 
-    `auto` takes the world for a camera world (KITTI's) if the mean of the cameras' up axes (-y) points clearly along
-    its -y, else for z-up.
+    Args:
+        T: T_source_camera.
+        world: the kind of that world, see `found_world`.
+        up: the direction of up in it, where it is not level; the least turn makes it so.
+
+    Raises:
+        UsageError: `up` has no direction, or the poses lie too far from their origin to be turned about it.
     """
-    if world == "auto":
-        up_world = -T[:, :3, 1].mean(axis=0)
-        world = "camera" if -up_world[1] > UPRIGHT and -up_world[1] > abs(up_world[2]) else "z_up"
-    return T_Z_UP_SOURCE[world] @ T, T_Z_UP_SOURCE[world].copy()
+    T_world_source = T_Z_UP_SOURCE[found_world(T, world)].copy()
+    if up is not None:
+        length = np.linalg.norm(up)
+        if not 1e-6 < length < np.inf:
+            raise UsageError(f"{up} has no direction", where="--poses-up", fix="give the one that jaxmap check tells")
+        if (np.abs(T[:, :3, 3]) > MAX_LOCAL_RANGE_M).any():
+            raise UsageError(
+                "the poses lie more than 10 km from their origin, as those of a coordinate reference system, whose up "
+                "is known",
+                where="--poses-up",
+                fix="leave it out",
+            )
+        up_about = T_world_source[:3, :3] @ np.array(up) / length
+        level = Rotation.align_vectors([[0.0, 0.0, 1.0]], up_about[None])[0]
+        T_world_source[:3, :3] = level.as_matrix() @ T_world_source[:3, :3]
+    return T_world_source @ T, T_world_source

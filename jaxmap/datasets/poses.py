@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from jaxmap.datasets.options import QuaternionOrder, TimeUnit
+from jaxmap.datasets.pose_axes import MAX_LOCAL_RANGE_M
 from jaxmap.datasets.pose_faults import find_wild_poses
 from jaxmap.datasets.pose_text import left_out, read_pose_text
 from jaxmap.datasets.text_files import data_lines
@@ -28,9 +29,6 @@ KNOT_TOLERANCE_S = 1e-3
 
 FEW_FRAMES, MOST_FRAMES = 0.5, 0.9
 """Times are in another unit where at most the first share of the frames has a pose, and then more than the second."""
-
-MAX_LOCAL_RANGE_M = 10_000.0
-"""Smaller coordinates need no site origin: float32 resolves 1 mm there."""
 
 
 @dataclass(frozen=True)

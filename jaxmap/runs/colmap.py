@@ -68,7 +68,8 @@ def _write_images(folder: RunFolder, names: set[str]) -> None:
     if (perceived := observations_in(source)) is not None:
         source = read_attributes(perceived).sequence
     # Only images are wanted: poses that took long to find are not sought again.
-    config = replace(config, poses=folder.poses, poses_world="auto") if str(config.poses) == "odometry" else config
+    if str(config.poses) == "odometry":
+        config = replace(config, poses=folder.poses, poses_world="auto", poses_up=None)
     sequence = open_sequence(source, config)
     turn = read_json(folder.metrics)["camera"].get("alignment_rad")
     front_end = StereoFrontEnd(sequence.camera, config.stereo, None if turn is None else np.array(turn, np.float64))

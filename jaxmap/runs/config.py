@@ -102,7 +102,10 @@ def load_perception(name_or_path: str) -> PerceiveConfig:
 OBSERVATIONS = "observations.zarr"
 """The folder of observations within that of a run of `jaxmap perceive`, or of `jaxmap map --keep-observations`."""
 
-_OF_POSES = ("poses", "poses_world", "pose_convention", "poses_are", "quaternion", "poses_time_unit", "poses_unit")
+_OF_POSES = (
+    *("poses", "poses_world", "poses_up", "pose_convention", "poses_are", "quaternion"),
+    *("poses_time_unit", "poses_unit"),
+)
 CHOSEN_ANEW = (*_OF_POSES, "max_pose_gap_s", "start", "stop", "stride", "strict")
 """Settings that begin anew where observations are fused: their own poses, and all of their frames."""
 

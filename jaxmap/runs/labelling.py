@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from jaxmap.checks.samples import spread_indices
 from jaxmap.datasets import StereoSequence
 from jaxmap.datasets.label_files import LabelFolder, open_label_folder
 from jaxmap.errors import JaxmapError, UsageError
@@ -27,6 +28,9 @@ from jaxmap.stereo.rectify import StereoRig
 from jaxmap.types import StereoCamera
 
 Notify = Callable[[str], None]
+
+LABELS_LOOKED_AT = 8
+"""Frames whose labels are looked at before the first is mapped."""
 
 BUNDLED_WIDTH_PX = 512
 """Width that the bundled network runs at: at twice that it takes four times as long for a hundredth of IoU."""
@@ -65,6 +69,16 @@ def choose_label_folder(config: PerceiveConfig, sequence: StereoSequence) -> Lab
         labels_are = "rectified"
     folder = open_label_folder(config.labels, len(config.classes or ROVER_CLASSES), labels_are, sequence.frames[0].name)
     return replace(folder, rectify=sequence.rectify_labels)
+
+
+def warn_of_masks(folder: LabelFolder, sequence: StereoSequence, notify: Notify) -> None:
+    """Tells where the labels of frames spread over a sequence look like black and white masks."""
+    names = [sequence.frames[index].name for index in spread_indices(len(sequence.frames), LABELS_LOOKED_AT)]
+    if folder.looks_binary(names):
+        notify(
+            f"note: the labels of {len(names)} frames are 0 and 255 alone, and 255 is no label: where they are black "
+            "and white masks, write the indices of --classes in their place"
+        )
 
 
 def choose_model(config: PerceiveConfig) -> tuple[ModelFile | None, SavedModel | None]:

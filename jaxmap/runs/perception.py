@@ -36,6 +36,7 @@ from jaxmap.runs.labelling import (
     choose_model,
     describe_network,
     network_size_px,
+    warn_of_masks,
 )
 from jaxmap.stereo.front_end import StereoFrontEnd
 from jaxmap.types import StereoCamera, pinhole
@@ -136,6 +137,8 @@ def plan_perception(
     if not source.startswith(SAMPLE_PREFIX) or config.poses or config.calibration:
         findings = warn_of_faults(sequence, front_end, strict=config.strict, notify=notify)
     label_folder = choose_label_folder(config, sequence)
+    if label_folder is not None:
+        warn_of_masks(label_folder, sequence, notify)
     model, network = choose_model(config)
     with as_usage_error():
         soft = None if label_folder is None else label_folder.soft
@@ -223,7 +226,7 @@ def _with_poses(observations: Observations, config: PerceiveConfig, notify: Noti
         raise JaxmapError(
             f"none of {len(timestamps_s)} frames has a pose", where=config.poses, fix="check that both use one clock"
         )
-    T_world_camera, _ = to_z_up(T_source_camera[has_pose], config.poses_world)
+    T_world_camera, _ = to_z_up(T_source_camera[has_pose], config.poses_world, config.poses_up)
     T_world_camera[:, :3, 3] -= np.array(observations.attributes.site_origin)
     kept = observations.selected(np.flatnonzero(has_pose))
     away_m = float(np.median(np.linalg.norm((T_world_camera - kept.T_world_camera)[:, :3, 3], axis=1)))

@@ -43,7 +43,7 @@ SOFT_START_M = 0.03
 
 _DATA = (
     *("labels", "labels_are", "calibration", "baseline_unit", "start", "stop", "stride", "poses", "poses_world"),
-    *("pose_convention", "poses_are", "poses_unit", "poses_time_unit", "quaternion"),
+    *("poses_up", "pose_convention", "poses_are", "poses_unit", "poses_time_unit", "quaternion"),
 )
 """Settings that are of the data tuned on, and not of how they are mapped."""
 

@@ -1,6 +1,6 @@
-"""What geometry and appearance bring: each source of labels on the same traverses, by the matcher of before and now.
+"""What geometry and appearance bring: each source of labels on the same traverses, by several matchers.
 
-    python scripts/experiments/relief_ladder.py [TRAVERSE...] [--model F] [--json F]
+    python scripts/experiments/relief_ladder.py [TRAVERSE...] [--matchers M...] [--labels L...] [--stop N] [--json F]
 
 A TRAVERSE is `sample:traverse` or a folder in the simulator's layout; by default the sample and the two of another
 renderer beside the repository. Maps are made under the default rule with the reader's own poses and scored in cells of
@@ -23,8 +23,8 @@ from jaxmap.stereo.match import StereoOptions
 DEFAULT = ("sample:traverse", SHARED / "simdata" / "traverse_a", SHARED / "simdata" / "traverse_b")
 BEFORE = StereoOptions(block_size=5, p1=200, p2=800, speckle_window=100, edge_step_px=0.0)
 EDGES = StereoOptions(edge_step_px=0.0)
-MATCHERS = {"before": BEFORE, "blocks, penalties": EDGES, "... less edges (now)": StereoOptions()}
-"""The last adds to the one before it."""
+MATCHERS = {"before": BEFORE, "edges kept": EDGES, "now": StereoOptions(), "sgm": StereoOptions(matcher="sgm")}
+"""`now` is the default, which drops edges of depth; `sgm` is jaxmap's own, in the step, and slow on a CPU."""
 
 
 def sources(traverse: Traverse, model: Path | None) -> dict[str, MapConfig]:
@@ -47,18 +47,21 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("traverses", nargs="*", help="sample:traverse, or folders that hold a part and gt")
     parser.add_argument("--model", type=Path, help="a network other than the bundled one")
-    parser.add_argument("--matchers", nargs="+", choices=list(MATCHERS), default=list(MATCHERS))
+    parser.add_argument("--matchers", nargs="+", choices=list(MATCHERS), default=["now"])
+    parser.add_argument("--labels", nargs="+", help="sources of labels, as the table names them; by default all")
+    parser.add_argument("--stop", type=int, help="frame to stop before")
     parser.add_argument("--json", type=Path, help="file for the table")
     given = parse(parser)
     scores = ("accuracy", "iou", "precision", "recall", "ece")
-    columns = {"traverse": "<16", "matcher": "<21", "labels": "<24", **dict.fromkeys(scores, "10.3f")}
+    columns = {"traverse": "<16", "matcher": "<12", "labels": "<24", **dict.fromkeys(scores, "10.3f")}
     table = Table({**columns, "mean IoU": "10.3f", "least": "7.3f", "greatest": "10.3f"})
     for path in given.traverses or [path for path in DEFAULT if str(path) == DEFAULT[0] or Path(path).exists()]:
         traverse = Traverse(path)
         for matcher in given.matchers:
-            for name, config in sources(traverse, given.model).items():
+            known = sources(traverse, given.model)
+            for name in given.labels or known:
                 frames = Frames(traverse.sequence, traverse.truth)
-                result = frames.scored(replace(config, stereo=MATCHERS[matcher]))
+                result = frames.scored(replace(known[name], stereo=MATCHERS[matcher], stop=given.stop))
                 ious = result.lattice_ious()
                 numbers = [result.scores[one] or 0.0 for one in scores]
                 table.row(traverse.name, matcher, name, *numbers, float(np.mean(ious)), min(ious), max(ious))

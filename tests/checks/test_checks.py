@@ -12,10 +12,12 @@ import yaml
 from PIL import Image
 from scenes import CAMERA, HEIGHT_PX, WIDTH_PX, write_folder_sequence
 
+from jaxmap.checks.calibration import calibration_findings
 from jaxmap.checks.check import QUICK, THOROUGH, CheckReport, check_sequence, open_front_end
 from jaxmap.commands.check import main
 from jaxmap.datasets import ReadOptions, open_sequence
 from jaxmap.stereo.match import StereoOptions
+from jaxmap.stereo.rectify import StereoRig, make_rectifier, make_stereo_rig
 
 FRAMES = 4
 
@@ -115,6 +117,36 @@ def test_a_baseline_in_another_unit_is_told(folder, baseline, option):
     (folder / "camera.yaml").write_text(yaml.safe_dump(CAMERA | {"baseline_m": baseline}))
     found = next(found for found in checked(folder).findings if found.kind == "baseline-unit")
     assert found.stops and option in found.fix
+
+
+@pytest.mark.parametrize("size", [2.0, 0.5])
+def test_a_calibration_of_images_of_another_size_is_told(folder, size):
+    scaled = {name: size * CAMERA[name] for name in ("fx_px", "cx_px", "cy_px")}
+    (folder / "camera.yaml").write_text(yaml.safe_dump(CAMERA | scaled))
+    assert "principal-point" in kinds(checked(folder))
+
+
+def rig(distortion: list[float], turned_rad: float) -> StereoRig:
+    """A calibration of raw images; the right camera is turned about its vertical."""
+    K = [[200.0, 0, 79.5], [0, 200.0, 59.5], [0, 0, 1]]
+    return make_stereo_rig(
+        K_left=K,
+        distortion_left=distortion,
+        K_right=K,
+        distortion_right=distortion,
+        R_right_left=cv2.Rodrigues(np.array([0.0, turned_rad, 0.0]))[0],
+        t_right_left_m=[-0.2, 0, 0],
+        size_px=(160, 120),
+    )
+
+
+def test_raw_images_without_distortion_are_told_unless_they_are_simulated():
+    bent, straight = [-0.3, 0.1, 0.0, 0.0], [0.0] * 4
+    camera = make_rectifier(rig(bent, 0.01)).camera
+    assert not calibration_findings(rig(bent, 0.01), camera)
+    (found,) = calibration_findings(rig(straight, 0.01), camera)
+    assert found.kind == "no-distortion" and not found.stops
+    assert not calibration_findings(rig(straight, 0.0), camera)
 
 
 def test_what_is_nearer_than_searched_is_told(folder):

@@ -186,6 +186,15 @@ def test_a_camera_that_is_pitched_on_the_body_of_the_poses_is_told_with_its_moun
     assert alone.fix == mounting.fix
 
 
+def test_a_principal_point_that_turns_the_view_by_some_degrees_is_told():
+    T = drive(2)
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_euler("xy", [5, 5], degrees=True).as_matrix()
+    (found,) = pose_convention(T @ turned, seen(T), normals_of(T))
+    assert (found.kind, found.stops) == ("camera-mounting", False)
+    assert "principal point" in found.fix
+
+
 def test_poses_of_another_drive_disagree_by_no_convention():
     found = pose_convention(drive(5), seen(drive(6)[:, :, [1, 2, 0, 3]] @ np.eye(4)), [])
     assert all(finding.kind in ("poses-disagree", "pose-convention") for finding in found)

@@ -70,6 +70,21 @@ def test_frames_are_chosen_like_a_slice_and_share_one_world(tmp_path):
     np.testing.assert_array_equal(part.site_origin, whole.site_origin)
 
 
+@pytest.mark.parametrize(("per_second", "unit"), [(1e3, "milliseconds"), (1e9, "nanoseconds")])
+def test_frames_in_another_unit_than_the_poses_are_refused_though_the_first_has_a_pose(tmp_path, per_second, unit):
+    times = "".join(f"{round(index / 10 * per_second)}\n" for index in range(5))
+    message = refused(plain_folder(tmp_path, times=times))
+    assert f"times of the frames look like {unit}, so that 20% of the frames have a pose" in message
+    assert "times.txt" in message
+
+
+def test_a_world_is_levelled_by_its_up_and_the_map_keeps_the_turn(tmp_path):
+    sequence = open_sequence(plain_folder(tmp_path), ReadOptions(poses_up=(0.0, 0.6, 0.8)))
+    np.testing.assert_allclose(sequence.T_world_source[:3, :3] @ [0, 0.6, 0.8], [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(sequence.T_world_camera, sequence.T_world_source @ track_of(5), atol=1e-9)
+    assert sequence.pose_reading.poses_world == "z_up"
+
+
 def test_an_empty_selection_reports_how_many_frames_there_are(tmp_path):
     message = refused(plain_folder(tmp_path), ReadOptions(start=5))
     assert message == "start 5, stop None, stride 1 select none of 5 frames in SOURCE; choose another range"

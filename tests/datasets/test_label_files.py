@@ -42,6 +42,17 @@ def one_hot() -> np.ndarray:
     return np.eye(3, dtype=np.float32)[truth()]
 
 
+@pytest.mark.parametrize(
+    ("values", "binary"), [((0, 255), True), ((0, 1, 255), False), ((0,), False), ((1, 255), False)]
+)
+def test_black_and_white_masks_are_known(tmp_path, values, binary):
+    for index, value in enumerate(values):
+        Image.fromarray(np.full((6, 9), value, np.uint8)).save(tmp_path / f"f{index}.png")
+    names = [f"f{index}" for index in range(len(values))]
+    assert LabelFolder(tmp_path, False, 3, "raw").looks_binary([*names, "missing"]) is binary
+    assert not LabelFolder(tmp_path, True, 3, "raw").looks_binary(names)
+
+
 def test_indices_come_as_they_are(tmp_path):
     labels = truth()
     labels[:10] = IGNORE

@@ -19,6 +19,7 @@ from jaxmap.datasets.pose_axes import (
     with_other_quaternions,
 )
 from jaxmap.datasets.poses import write_tum
+from jaxmap.errors import UsageError
 
 READINGS = [
     PoseReading(convention, world, are)
@@ -68,6 +69,26 @@ def test_up_and_ahead_of_each_world_become_z_and_y(world, up, ahead):
     _, T_world_source = to_z_up(np.eye(4)[None], world)
     np.testing.assert_array_equal(T_world_source[:3, :3] @ up, [0, 0, 1])
     np.testing.assert_array_equal(T_world_source[:3, :3] @ ahead, [0, 1, 0])
+
+
+@given(seed=st.integers(0, 2**32 - 1), world=st.sampled_from(sorted(T_Z_UP_SOURCE)))
+def test_a_world_that_is_not_level_is_turned_by_the_least_that_makes_it_so(seed, world):
+    tilt = Rotation.from_rotvec([*np.random.default_rng(seed).uniform(-0.5, 0.5, 2), 0.0])
+    up = T_Z_UP_SOURCE[world][:3, :3].T @ tilt.as_matrix().T @ [0.0, 0.0, 1.0]
+    T = random_poses(seed)
+    turned, T_world_source = to_z_up(T, world, tuple(3 * up))
+    np.testing.assert_allclose(T_world_source[:3, :3] @ up, [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(T_world_source[:3, :3], tilt.as_matrix() @ T_Z_UP_SOURCE[world][:3, :3], atol=1e-9)
+    np.testing.assert_allclose(turned, T_world_source @ T, atol=1e-9)
+
+
+def test_an_up_that_cannot_be_is_refused():
+    with pytest.raises(UsageError, match="no direction"):
+        to_z_up(np.eye(4)[None], "z_up", (0.0, 0.0, 0.0))
+    far = np.eye(4)[None].copy()
+    far[0, 0, 3] = 5e5
+    with pytest.raises(UsageError, match="coordinate reference system"):
+        to_z_up(far, "z_up", (0.0, 0.1, 1.0))
 
 
 @given(seed=st.integers(0, 2**32 - 1), reading=st.sampled_from(READINGS))
