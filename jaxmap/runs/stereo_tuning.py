@@ -39,7 +39,7 @@ from jaxmap.runs.tuning import (
 )
 from jaxmap.stereo.jax_matcher import JaxMatcher
 from jaxmap.tuning.cell_scores import ScoredCells
-from jaxmap.tuning.descent import Step, follow
+from jaxmap.tuning.descent import Slope, Step, go_down
 from jaxmap.tuning.options import TuneOptions
 from jaxmap.tuning.parametrisation import TunedParams
 from jaxmap.tuning.small_frames import small_camera, small_design, small_frame
@@ -134,19 +134,27 @@ class StereoTuningRun:
             JaxmapError: the loss diverges, or writing failed; what was best before is kept.
         """
         history: list[dict[str, float]] = []
+        tried = 0
 
-        def slope(free: FreeMatch) -> tuple[tuple[jax.Array, jax.Array], FreeMatch]:
-            match, pull = jax.vjp(lambda free: matched_by(free, self._start), free)
-            every = [gradient.of(match) for gradient in self._gradients]
-            tuned, held_out = (jnp.stack(values).mean() for values in zip(*(one[0] for one in every), strict=True))
-            total = jax.tree.map(lambda *leaves: jnp.stack(leaves).mean(0), *(one[1] for one in every))
-            return (tuned, held_out), pull(total)[0]
+        def losses(free: FreeMatch) -> tuple[tuple[jax.Array, jax.Array], list[jax.Array]]:
+            every = [gradient.losses(matched_by(free, self._start)) for gradient in self._gradients]
+            tuned, held_out = (jnp.stack(values).mean() for values in zip(*(both for both, _ in every), strict=True))
+            return (tuned, held_out), [cotangent for _, cotangent in every]
+
+        def pull(free: FreeMatch, cotangents: list[jax.Array]) -> FreeMatch:
+            match, back = jax.vjp(lambda free: matched_by(free, self._start), free)
+            every = [one.pull(match, mine) for one, mine in zip(self._gradients, cotangents, strict=True)]
+            return back(jax.tree.map(lambda *leaves: jnp.stack(leaves).mean(0), *every))[0]
 
         def on_step(step: Step) -> None:
-            history.append({"step": step.number, "loss": step.losses.tuned, "held_out": step.losses.held_out})
+            nonlocal tried
+            tried = step.number
+            if step.taken:
+                history.append({"step": step.number, "loss": step.losses.tuned, "held_out": step.losses.held_out})
             if step.best:
                 self._write_config(matched_by(step.free, self._start))
-            advance(step.number, f"loss {step.losses.tuned:.4f}, held out {step.losses.held_out:.4f}")
+            note = "" if step.taken else ": taken back"
+            advance(step.number, f"loss {step.losses.tuned:.4f}, held out {step.losses.held_out:.4f}{note}")
 
         start = free_match(self._start)
         frozen = self._options.frozen
@@ -154,10 +162,11 @@ class StereoTuningRun:
             name: jax.tree.map(lambda leaf, name=name: jnp.full_like(leaf, name not in frozen), leaves)
             for name, leaves in start.items()
         }
-        best = follow(slope, start, self._options.descent, moves=moves, on_step=on_step)
+        best = go_down(Slope(losses, pull), start, self._options.descent, moves=moves, on_step=on_step)
         after = matched_by(best.free, self._start)
         self._write_config(after)
-        record = {"name": "tuned", "best_step": best.number, "parameters": _plain(after), "history": history}
+        record = {"name": "tuned", "best_step": best.number, "tried": tried, "history": history}
+        record |= {"parameters": _plain(after)}
         old = [self._score(one, one, plan) for one, plan in zip(self._traverses, self._plans, strict=True)]
         record |= scores_of_parts(self._traverses, old, self._scores_after(after), self._options.seed)
         read = list(zip(self._sources, self._plans, self._traverses, strict=True))

@@ -18,11 +18,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxmap.fusion.carve import carve
 from jaxmap.fusion.integrate import add_evidence
-from jaxmap.fusion.sensor_model import frame_evidence, point_weights
+from jaxmap.fusion.params import FusionParams
+from jaxmap.fusion.sensor_model import frame_evidence, point_weights, total_weight
 from jaxmap.fusion.splat import splat_trilinear
 from jaxmap.geometry.cloud import project
 from jaxmap.geometry.grid import view_window
@@ -33,7 +34,7 @@ from jaxmap.matching.match import grey
 from jaxmap.matching.soft import soft_match
 from jaxmap.tuning.map_loss import cells_loss, soft_cells
 from jaxmap.tuning.options import MapLossOptions
-from jaxmap.tuning.soft_view import soft_columns_of_map
+from jaxmap.tuning.soft_view import columns_of_grid, soft_columns
 from jaxmap.tuning.traverse_loss import Traverse
 from jaxmap.types import Frame, GridSpec, PointLabels
 
@@ -63,10 +64,22 @@ class StereoTraverse:
 
 
 class StereoGradient(NamedTuple):
-    """`(match) -> (losses, gradient of the first)`, and `lower`: that of one frame, for its memory."""
+    """The loss of a traverse, and its gradient where that is wanted.
 
-    of: Callable[[MatchParams], tuple[Losses, MatchParams]]
+    Attributes:
+        losses: `(match) -> (losses, cotangent)`: the losses, and the gradient of the first in the map's evidence.
+        pull: `(match, cotangent) -> gradient`: that pulled back to the matcher, which takes twice the time.
+        lower: `pull` of one frame, for its memory.
+    """
+
+    losses: Callable[[MatchParams], tuple[Losses, Array]]
+    pull: Callable[[MatchParams, Array], MatchParams]
     lower: Callable[[], jax.stages.Lowered]
+
+    def of(self, match: MatchParams) -> tuple[Losses, MatchParams]:
+        """The losses, and the gradient of the first."""
+        losses, cotangent = self.losses(match)
+        return losses, self.pull(match, cotangent)
 
 
 def soft_evidence(
@@ -108,7 +121,34 @@ def soft_evidence(
     weights = point_weights(grid, cloud, rule) * matched.confidence.reshape(-1) * times**2
     rows = _shares(labels, len(labeller.classes)) * weights
     counts = splat_trilinear(window, cloud.points_world, rows, labels.keep)
-    return frame_evidence(counts, free, fusion, rule), window
+    evidence = frame_evidence(counts, None, fusion, rule)
+    if free is not None:
+        evidence = evidence.at[0].add(soft_misses(counts, free, fusion))
+    return evidence, window
+
+
+def soft_misses(
+    counts: Float[Array, "C1 X Y Z"], free: Bool[Array, "X Y Z"], fusion: FusionParams
+) -> Float[Array, "X Y Z"]:
+    """What a frame takes from the occupancy of voxels that it saw through; less, the more of a point lies in them.
+
+    A whole point keeps a voxel from being free, as in `fusion.sensor_model.frame_evidence`. If the least share of a
+    point did so, too, the loss would jump wherever one comes near a voxel.
+    """
+    untouched = jnp.maximum(1.0 - total_weight(counts), 0.0)
+    return jnp.where(free, untouched * (fusion.occupancy_miss - fusion.occupancy_prior), 0.0)
+
+
+def soft_touch(log_odds: Float[Array, "K X Y Z"], width: float) -> Float[Array, "X Y Z"]:
+    """How much voxels were touched, from 0 for those that hold nothing to 1.
+
+    That a voxel was touched at all makes it solid by half (its occupancy is even), and shares of points touch many.
+
+    Args:
+        log_odds: of the map, occupancy first.
+        width: log-odds of occupancy in which touch grows.
+    """
+    return -jnp.expm1(-jnp.abs(log_odds[0]) / width)
 
 
 def _shares(labels: PointLabels, classes: int) -> Float[Array, "C1 N"]:
@@ -129,8 +169,9 @@ def stereo_losses(
     A cell that was observed at the start counts, whatever is made of it later: no numbers gain by refusing to look.
     """
     fusion, rule, arrays = traverse.params.fusion, traverse.mapper.design.rule, traverse.scored.arrays
-    voxel_map = replace(traverse.mapper.init(), log_odds=log_odds)
-    columns = soft_columns_of_map(voxel_map, fusion, rule, target, options.softness)
+    touched = soft_touch(log_odds, options.softness.occupied)
+    classes = traverse.mapper.design.labeller.classes
+    columns = soft_columns(log_odds, touched, columns_of_grid(), fusion, rule, classes, target, options.softness)
     said = soft_cells(columns, arrays.truth.shares, jax.nn.sigmoid(fusion.class_prior[target]), options)
     counted = arrays.truth.counted
     tuned, held_out = (
@@ -174,16 +215,18 @@ def make_stereo_gradient(traverse: StereoTraverse, target: int, options: MapLoss
     add_one, pull_one = jax.jit(add, donate_argnums=0), jax.jit(pull, donate_argnums=0)
     score_map = jax.jit(score)
 
-    def of(match: MatchParams) -> tuple[Losses, MatchParams]:
+    def losses(match: MatchParams) -> tuple[Losses, Array]:
         log_odds = jnp.zeros_like(empty.log_odds)
         for number, frame in enumerate(traverse.frames):
             log_odds = add_one(log_odds, match, frame, number)
-        losses, cotangent = score_map(log_odds)
+        return score_map(log_odds)
+
+    def pull_all(match: MatchParams, cotangent: Array) -> MatchParams:
         gradient = jax.tree.map(jnp.zeros_like, match)
         for number, frame in enumerate(traverse.frames):
             gradient = pull_one(gradient, cotangent, match, frame, number)
-        return losses, gradient
+        return gradient
 
     match = traverse.params.match
     assert match is not None
-    return StereoGradient(of, lambda: pull_one.lower(match, empty.log_odds, match, traverse.frames[0], 0))
+    return StereoGradient(losses, pull_all, lambda: pull_one.lower(match, empty.log_odds, match, traverse.frames[0], 0))
