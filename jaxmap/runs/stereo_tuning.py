@@ -1,7 +1,7 @@
 """`jaxmap tune --through stereo`: tunes how pairs are matched by the score of the map that comes out.
 
-Frames are matched softly, smaller than they are, at every step (`tuning.stereo_evidence`). What is scored, before and
-after, is the map as `jaxmap map` makes it: matched with hard minima, at full size.
+Frames are matched softly, smaller than they are, at every step, and mapped at full size (`tuning.stereo_evidence`).
+What is scored, before and after, is the map as `jaxmap map` makes it: matched with hard minima, at full size.
 """
 
 from __future__ import annotations
@@ -37,16 +37,17 @@ from jaxmap.runs.tuning import (
     usable_frames,
     write_result,
 )
+from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.stereo.jax_matcher import JaxMatcher
 from jaxmap.tuning.cell_scores import ScoredCells
 from jaxmap.tuning.descent import Slope, Step, go_down
 from jaxmap.tuning.options import TuneOptions
 from jaxmap.tuning.parametrisation import TunedParams
-from jaxmap.tuning.small_frames import small_camera, small_design, small_frame
+from jaxmap.tuning.small_frames import SmallPair, small_design, small_pair
 from jaxmap.tuning.stereo_evidence import StereoGradient, StereoTraverse, make_stereo_gradient
 from jaxmap.tuning.stereo_params import FreeMatch, free_match, matched_by
 from jaxmap.tuning.traverse_loss import Traverse, check_classes, score_cells
-from jaxmap.types import Frame
+from jaxmap.types import Frame, to_device
 
 _WHERE = "--through stereo"
 
@@ -109,17 +110,18 @@ class StereoTuningRun:
         """
         times, done = self._options.smaller, 0
         for source, plan in zip(self._sources, self._plans, strict=True):
-            small: list[Frame] = []
+            seen: list[tuple[Frame, SmallPair]] = []
 
-            def on_frame(prepared: PreparedFrame, small: list[Frame] = small) -> None:
+            def on_frame(prepared: PreparedFrame, seen: list[tuple[Frame, SmallPair]] = seen) -> None:
                 nonlocal done
                 if prepared.frame is not None and prepared.rectified is not None:
-                    small.append(small_frame(prepared.frame, prepared.rectified, times))
+                    frame = replace(prepared.frame, disparity_px=None, blind=_blind(prepared.rectified))
+                    seen.append((frame, small_pair(prepared.rectified, times)))
                 done += 1
                 advance(done)
 
             self._traverses.append(self._read(source, plan, on_frame))
-            traverse = _small_traverse(plan, self._traverses[-1], small, times)
+            traverse = _small_traverse(plan, self._traverses[-1], seen, times)
             self._gradients.append(make_stereo_gradient(traverse, self._target, self._options.loss))
         check_classes(self._traverses, self._truth.target)
 
@@ -223,21 +225,24 @@ def _matcher(plan: Plan) -> JaxMatcher:
     return plan.front_end.matcher
 
 
-def _small_traverse(plan: Plan, scored: Traverse, frames: list[Frame], times: int) -> StereoTraverse:
-    """The traverse with small frames, and a step that matches them softly."""
-    camera = small_camera(plan.front_end.camera, times)
-    poses = plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified
+def _blind(rectified: RectifiedFrame) -> jax.Array:
+    """The pixels that have no disparity, whatever is matched; of the same form for every frame."""
+    return to_device(np.zeros(rectified.left.shape[:2], bool) if rectified.blind is None else rectified.blind)
+
+
+def _small_traverse(plan: Plan, scored: Traverse, frames: list[tuple[Frame, SmallPair]], times: int) -> StereoTraverse:
+    """The traverse with small pairs, and a step that matches them softly."""
+    camera, matcher = plan.front_end.camera, _matcher(plan)
     mapper = make_mapper(
         camera,
         plan.grid,
         plan.labeller,
         plan.rule,
         plan.depth_range_m,
-        match=small_design(_matcher(plan).design, times),
-        T_world_camera=poses,
+        match=small_design(matcher.design, camera.width_px * camera.height_px, times),
+        T_world_camera=plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified,
     )
-    params = replace(plan.params, camera=camera, match=_matcher(plan).params)
-    return StereoTraverse(scored, mapper, frames, params, plan.key, times)
+    return StereoTraverse(scored, mapper, frames, replace(plan.params, match=matcher.params), plan.key, times)
 
 
 def _plain(match: MatchParams) -> dict[str, float]:

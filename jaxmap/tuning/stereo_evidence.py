@@ -30,10 +30,10 @@ from jaxmap.geometry.grid import view_window
 from jaxmap.labellers.base import fusible, labels_of
 from jaxmap.mapping.step import Mapper, MapperParams, StepDesign
 from jaxmap.matching.design import MatchParams
-from jaxmap.matching.match import grey
 from jaxmap.matching.soft import soft_match
 from jaxmap.tuning.map_loss import cells_loss, soft_cells
 from jaxmap.tuning.options import MapLossOptions
+from jaxmap.tuning.small_frames import SmallPair, at_full_size
 from jaxmap.tuning.soft_view import columns_of_grid, soft_columns
 from jaxmap.tuning.traverse_loss import Traverse
 from jaxmap.types import Frame, GridSpec, PointLabels
@@ -48,16 +48,16 @@ class StereoTraverse:
 
     Attributes:
         scored: the cells that count, and how they are scored.
-        mapper: of the small frames; its design matches softly.
-        frames: small (`tuning.small_frames`).
+        mapper: its design matches the small pairs softly; all else is of the full size.
+        frames: with a pair of images for each, smaller than they are (`tuning.small_frames`).
         params: all numbers, those of matching at their start.
         key: that of the map.
-        times: how many times smaller the frames are: a pixel stands for so many squared.
+        times: how many times smaller the pairs are.
     """
 
     scored: Traverse
     mapper: Mapper
-    frames: list[Frame]
+    frames: list[tuple[Frame, SmallPair]]
     params: MapperParams
     key: PRNGKeyArray
     times: int
@@ -83,27 +83,34 @@ class StereoGradient(NamedTuple):
 
 
 def soft_evidence(
-    design: StepDesign, grid: GridSpec, frame: Frame, params: MapperParams, frame_key: PRNGKeyArray, times: int = 1
+    design: StepDesign,
+    grid: GridSpec,
+    frame: Frame,
+    pair: SmallPair,
+    params: MapperParams,
+    frame_key: PRNGKeyArray,
+    times: int = 1,
 ) -> tuple[Float[Array, "C1 X Y Z"], GridSpec]:
     """What a frame says of the voxels of its window; differentiable in `params.match`.
 
     It is what the step makes of the frame (`mapping.step.see_frame`), but for soft matching and shared-out points.
 
     Args:
-        design: of the step; its matching is soft.
+        design: of the step; its matching is soft, and that of the pair.
         grid: of the map.
-        frame: with both images.
+        frame: its disparity is left aside.
+        pair: its images.
         params: the numbers.
         frame_key: of the frame.
-        times: how many times smaller the images are.
+        times: how many times smaller the pair is.
     """
     assert design.match is not None and params.match is not None
-    assert frame.image is not None and frame.right_image is not None
     labeller, rule, depth_range_m = design.labeller, design.rule, design.depth_range_m
     camera, pose, fusion = params.camera, frame.T_world_camera, params.fusion
-    left, right = grey(frame.image), grey(frame.right_image)
-    matched = soft_match(design.match, left, right, params.match)
-    disparity_px = matched.disparity_px
+    shape = camera.height_px, camera.width_px
+    matched = soft_match(design.match, *pair, params.match)
+    disparity_px = times * at_full_size(matched.disparity_px, shape, times)
+    confidence = jnp.nan_to_num(at_full_size(matched.confidence, shape, times))
     if frame.blind is not None:
         disparity_px = jnp.where(frame.blind, jnp.nan, disparity_px)
     cloud = project(camera, pose, disparity_px, depth_range_m, fusion.disparity_sigma_px, labeller.ground)
@@ -116,9 +123,9 @@ def soft_evidence(
     window = view_window(grid, camera, pose, depth_range_m[1], design.window_shape)
     free = None
     if rule.carve:
-        depth_m, sure = jax.lax.stop_gradient((cloud.depth_m, cloud.valid & (matched.confidence >= 0.5)))
+        depth_m, sure = jax.lax.stop_gradient((cloud.depth_m, cloud.valid & (confidence >= 0.5)))
         free = carve(camera, pose, depth_m, sure, window, fusion, depth_range_m)
-    weights = point_weights(grid, cloud, rule) * matched.confidence.reshape(-1) * times**2
+    weights = point_weights(grid, cloud, rule) * confidence.reshape(-1)
     rows = _shares(labels, len(labeller.classes)) * weights
     counts = splat_trilinear(window, cloud.points_world, rows, labels.keep)
     evidence = frame_evidence(counts, None, fusion, rule)
@@ -192,12 +199,14 @@ def make_stereo_gradient(traverse: StereoTraverse, target: int, options: MapLoss
     design, key, times = traverse.mapper.design, traverse.key, traverse.times
     empty = traverse.mapper.init()
 
-    def evidence(match: MatchParams, frame: Frame, number: Int[Array, ""] | int) -> tuple[Array, GridSpec]:
+    def evidence(
+        match: MatchParams, seen: tuple[Frame, SmallPair], number: Int[Array, ""] | int
+    ) -> tuple[Array, GridSpec]:
         params = replace(traverse.params, match=match)
-        return soft_evidence(design, empty.grid, frame, params, jax.random.fold_in(key, number), times)
+        return soft_evidence(design, empty.grid, *seen, params, jax.random.fold_in(key, number), times)
 
-    def add(log_odds: Array, match: MatchParams, frame: Frame, number: Int[Array, ""] | int) -> Array:
-        return add_evidence(replace(empty, log_odds=log_odds), *evidence(match, frame, number)).log_odds
+    def add(log_odds: Array, match: MatchParams, seen: tuple[Frame, SmallPair], number: Int[Array, ""] | int) -> Array:
+        return add_evidence(replace(empty, log_odds=log_odds), *evidence(match, seen, number)).log_odds
 
     def score(log_odds: Array) -> tuple[Losses, Array]:
         return jax.value_and_grad(lambda log_odds: stereo_losses(log_odds, traverse, target, options), has_aux=True)(
@@ -205,9 +214,13 @@ def make_stereo_gradient(traverse: StereoTraverse, target: int, options: MapLoss
         )
 
     def pull(
-        gradient: MatchParams, cotangent: Array, match: MatchParams, frame: Frame, number: Int[Array, ""] | int
+        gradient: MatchParams,
+        cotangent: Array,
+        match: MatchParams,
+        seen: tuple[Frame, SmallPair],
+        number: Int[Array, ""] | int,
     ) -> MatchParams:
-        said, back, window = jax.vjp(lambda match: evidence(match, frame, number), match, has_aux=True)
+        said, back, window = jax.vjp(lambda match: evidence(match, seen, number), match, has_aux=True)
         corner = (jnp.zeros((), jnp.int32), *(window.first - empty.grid.first))
         here = jax.lax.dynamic_slice(cotangent, corner, said.shape)
         return jax.tree.map(jnp.add, gradient, back(here)[0])
@@ -217,14 +230,14 @@ def make_stereo_gradient(traverse: StereoTraverse, target: int, options: MapLoss
 
     def losses(match: MatchParams) -> tuple[Losses, Array]:
         log_odds = jnp.zeros_like(empty.log_odds)
-        for number, frame in enumerate(traverse.frames):
-            log_odds = add_one(log_odds, match, frame, number)
+        for number, seen in enumerate(traverse.frames):
+            log_odds = add_one(log_odds, match, seen, number)
         return score_map(log_odds)
 
     def pull_all(match: MatchParams, cotangent: Array) -> MatchParams:
         gradient = jax.tree.map(jnp.zeros_like, match)
-        for number, frame in enumerate(traverse.frames):
-            gradient = pull_one(gradient, cotangent, match, frame, number)
+        for number, seen in enumerate(traverse.frames):
+            gradient = pull_one(gradient, cotangent, match, seen, number)
         return gradient
 
     match = traverse.params.match
