@@ -6,6 +6,7 @@ What is scored, before and after, is the map as `jaxmap map` makes it: matched w
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -189,13 +190,19 @@ class StereoTuningRun:
         return score_cells(replace(now, arrays=arrays, groups=before.groups), params, self._target)
 
     def _numbers(self, match: MatchParams, out: Path) -> dict[str, Any]:
-        """The stereo options that are tuned."""
+        """The stereo options that are tuned, with the weights in a file beside `out`; they are written already."""
         numbers = {
             "step_penalty": float(f"{float(match.p1):.6g}"),
             "jump_penalty": float(f"{float(match.p2):.6g}"),
             "uniqueness_ratio": round(100 * float(match.uniqueness)),
         }
-        return numbers | ({"cost_network": out.with_suffix(".safetensors").absolute()} if match.cost else {})
+        if not match.cost:
+            return numbers
+        sha256 = hashlib.sha256(self._out.with_suffix(".safetensors").read_bytes()).hexdigest()
+        return numbers | {
+            "cost_network": out.with_suffix(".safetensors").absolute(),
+            "cost_network_sha256": sha256,
+        }
 
     def _write_config(self, match: MatchParams) -> None:
         if match.cost:

@@ -76,7 +76,8 @@ def tune(given: Namespace) -> Path:
 def score(given: Namespace, tuned: list[Path]) -> None:
     """Matches and maps all traverses anew by each setting."""
     found = {path.stem: load_config(str(path)).stereo for path in tuned}
-    usual = {one.matcher: replace(one, **_USUAL, cost_network=given.cost_network) for one in found.values()}
+    network = {"cost_network": given.cost_network, "cost_network_sha256": None}
+    usual = {one.matcher: replace(one, **_USUAL, **network) for one in found.values()}
     settings = {**{f"default {matcher}": stereo for matcher, stereo in usual.items()}, **found}
     numbers = dict.fromkeys(("p1", "p2", "unique"), "7.3f")
     scores = dict.fromkeys((*PIXELS, *CELLS), "13.4f")
