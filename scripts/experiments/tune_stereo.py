@@ -54,7 +54,7 @@ def tune(given: Namespace) -> Path:
     stereo = StereoOptions(
         matcher=given.matcher,
         num_disparities=given.num_disparities,
-        cost_network=given.cost_network,
+        cost_network=_network(given.matcher, given),
         temperature=given.temperature,
     )
     configs = [config_of(traverse, stereo, given) for traverse in traverses]
@@ -76,8 +76,7 @@ def tune(given: Namespace) -> Path:
 def score(given: Namespace, tuned: list[Path]) -> None:
     """Matches and maps all traverses anew by each setting."""
     found = {path.stem: load_config(str(path)).stereo for path in tuned}
-    network = {"cost_network": given.cost_network, "cost_network_sha256": None}
-    usual = {one.matcher: replace(one, **_USUAL, **network) for one in found.values()}
+    usual = {one.matcher: replace(one, **_USUAL, cost_network=_network(one.matcher, given)) for one in found.values()}
     settings = {**{f"default {matcher}": stereo for matcher, stereo in usual.items()}, **found}
     numbers = dict.fromkeys(("p1", "p2", "unique"), "7.3f")
     scores = dict.fromkeys((*PIXELS, *CELLS), "13.4f")
@@ -97,7 +96,14 @@ def score(given: Namespace, tuned: list[Path]) -> None:
             table.write(given.json)
 
 
-_USUAL = {"step_penalty": None, "jump_penalty": None, "uniqueness_ratio": StereoOptions().uniqueness_ratio}
+def _network(matcher: str, given: Namespace) -> Path | None:
+    return given.cost_network if matcher == "mccnn" else None
+
+
+_USUAL = {
+    **dict.fromkeys(("step_penalty", "jump_penalty", "cost_network_sha256")),
+    "uniqueness_ratio": StereoOptions().uniqueness_ratio,
+}
 """The numbers that are tuned, as they are by default."""
 
 
