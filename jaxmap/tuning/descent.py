@@ -1,7 +1,7 @@
 """Gradient descent with a held-out loss: the best parameters are kept at every step, and it stops when they stay.
 
-`descend` and `follow` take every step of Adam: for losses that are smooth and cheap. `go_down` takes only steps under
-which the loss falls: for one with small steps of its own, whose gradient says little beyond them.
+`descend` takes every step of Adam: for smooth, cheap losses. `go_down` takes only steps under which the loss
+falls: for one that has small jumps of its own, which no gradient knows of.
 """
 
 from __future__ import annotations
@@ -63,22 +63,6 @@ def descend(
             handed to `on_step`.
     """
     slope = jax.jit(jax.value_and_grad(loss, has_aux=True))
-    return follow(lambda free: slope(free, *data), start, options, moves=moves, on_step=on_step)
-
-
-def follow(
-    slope: Callable[[PyTree], tuple[tuple[jax.Array, jax.Array], PyTree]],
-    start: PyTree,
-    options: DescentOptions,
-    *,
-    moves: PyTree | None = None,
-    on_step: Callable[[Step], None] = lambda step: None,
-) -> Step:
-    """The same along any gradient: `slope` gives both losses, and the gradient of the first.
-
-    Raises:
-        JaxmapError: as of `descend`.
-    """
     schedule = optax.cosine_decay_schedule(options.learning_rate, options.steps)
     optimiser = optax.chain(optax.clip_by_global_norm(options.max_norm), optax.adam(schedule))
 
@@ -93,7 +77,7 @@ def follow(
     free, state = start, optimiser.init(start)
     best, first = None, math.inf
     for number in range(options.steps + 1):
-        (tuned, held_out), gradient = slope(free)
+        (tuned, held_out), gradient = slope(free, *data)
         moved, state, finite = advance(free, state, gradient)
         losses = Losses(float(tuned), float(held_out))
         if number == 0:
