@@ -151,9 +151,8 @@ def go_down(
         (tuned, held_out), kept = slope.losses(free)
         losses = Losses(float(tuned), float(held_out))
         taken = math.isfinite(losses.tuned + losses.held_out) and losses.tuned < above
-        return Step(
-            number, losses, free, taken and (best is None or losses.held_out < best.losses.held_out), taken
-        ), kept
+        better = taken and (best is None or losses.held_out < best.losses.held_out)
+        return Step(number, losses, free, better, taken), kept
 
     def downhill(at: Step, kept: PyTree, state: PyTree) -> tuple[PyTree, PyTree]:
         way, state, finite = direction(slope.pull(at.free, kept), state)

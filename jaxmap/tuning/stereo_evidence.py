@@ -68,7 +68,7 @@ class StereoGradient(NamedTuple):
 
     Attributes:
         losses: `(match) -> (losses, cotangent)`: the losses, and the gradient of the first in the map's evidence.
-        pull: `(match, cotangent) -> gradient`: that pulled back to the matcher, which takes twice the time.
+        pull: `(match, cotangent) -> gradient`: that pulled back to the matcher, which takes about four times as long.
         lower: `pull` of one frame, for its memory.
     """
 
