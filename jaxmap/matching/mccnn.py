@@ -54,7 +54,7 @@ def load_cost_network(path: Path | None = None) -> CostNetwork:
         UsageError: no file is named, and the package, or what reads its file, is not installed.
         JaxmapError: the file is missing, broken, or holds another network.
     """
-    path = _packaged() if path is None else path
+    path = packaged_weights() if path is None else path
     tensors = _read_onnx(path) if path.suffix.lower() == ".onnx" else read_tensors(path)
     # A checkpoint of the package holds the optimiser's state, too.
     named = {name.removeprefix("model.").removeprefix("module."): value for name, value in tensors.items()}
@@ -174,7 +174,12 @@ def _convolution(tensors: dict[str, np.ndarray], number: int, channels: int, whe
     return Convolution(kernel, to_device(bias, np.float32)), shape[0]
 
 
-def _packaged() -> Path:
+def packaged_weights() -> Path:
+    """The file `PACKAGED` of the installed package.
+
+    Raises:
+        UsageError: it is not installed.
+    """
     spec = importlib.util.find_spec(_MODULE)
     if spec is None or spec.origin is None:
         raise UsageError(

@@ -39,6 +39,7 @@ from jaxmap.runs.labelling import (
     warn_of_masks,
 )
 from jaxmap.stereo.front_end import StereoFrontEnd
+from jaxmap.stereo.jax_matcher import JaxMatcher
 from jaxmap.types import StereoCamera, pinhole
 
 MapSettings = TypeVar("MapSettings", bound=PerceiveConfig)
@@ -101,7 +102,10 @@ class Perception:
         """The settings as plain values, with the sequence and what was left to the data resolved."""
         classes = {"classes": list(self.labeller.classes)} if self.labeller.classes else {}
         model = {"model_sha256": self.model.sha256} if self.model is not None else {}
-        return {"sequence": self.source, **config_tree(config), **classes, **model}
+        tree = config_tree(config)
+        if isinstance(self.front_end.matcher, JaxMatcher):
+            tree["stereo"] = tree["stereo"] | {"cost_network_sha256": self.front_end.matcher.network_sha256}
+        return {"sequence": self.source, **tree, **classes, **model}
 
 
 def plan_perception(
@@ -303,8 +307,9 @@ def check_perceived_so(config: PerceiveConfig, observations: Observations, *, ge
     elif config.labeller not in (attributes.labeller, "plane", "relief", "none"):
         kept = f"the observations hold no labels of {config.labeller}: they were perceived with {attributes.labeller}"
         raise UsageError(kept, where=where, fix="perceive the sequence again with that labeller")
-    # Without a checksum any model will do: it is not run again.
-    now["model_sha256"] = now.get("model_sha256") or then.get("model_sha256")
+    # Without a checksum any network will do: none is run again.
+    for name in ("model_sha256", "stereo.cost_network_sha256"):
+        now[name] = now.get(name) or then.get(name)
     differing = [name for name in now if now[name] != then.get(name) and not _is_free(name, attributes)]
     if differing:
         raise UsageError(

@@ -1,11 +1,12 @@
 """`jaxmap tune --through stereo`: tunes how pairs are matched by the score of the map that comes out.
 
-Frames are matched softly, smaller than they are, at every step (`tuning.stereo_evidence`). What is scored, before and
-after, is the map as `jaxmap map` makes it: matched with hard minima, at full size.
+Frames are matched softly, smaller than they are, at every step, and mapped at full size (`tuning.stereo_evidence`).
+What is scored, before and after, is the map as `jaxmap map` makes it: matched with hard minima, at full size.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,16 +38,17 @@ from jaxmap.runs.tuning import (
     usable_frames,
     write_result,
 )
+from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.stereo.jax_matcher import JaxMatcher
 from jaxmap.tuning.cell_scores import ScoredCells
-from jaxmap.tuning.descent import Step, follow
+from jaxmap.tuning.descent import Slope, Step, go_down
 from jaxmap.tuning.options import TuneOptions
 from jaxmap.tuning.parametrisation import TunedParams
-from jaxmap.tuning.small_frames import small_camera, small_design, small_frame
+from jaxmap.tuning.small_frames import SmallPair, small_design, small_pair
 from jaxmap.tuning.stereo_evidence import StereoGradient, StereoTraverse, make_stereo_gradient
 from jaxmap.tuning.stereo_params import FreeMatch, free_match, matched_by
 from jaxmap.tuning.traverse_loss import Traverse, check_classes, score_cells
-from jaxmap.types import Frame
+from jaxmap.types import Frame, to_device
 
 _WHERE = "--through stereo"
 
@@ -109,17 +111,18 @@ class StereoTuningRun:
         """
         times, done = self._options.smaller, 0
         for source, plan in zip(self._sources, self._plans, strict=True):
-            small: list[Frame] = []
+            seen: list[tuple[Frame, SmallPair]] = []
 
-            def on_frame(prepared: PreparedFrame, small: list[Frame] = small) -> None:
+            def on_frame(prepared: PreparedFrame, seen: list[tuple[Frame, SmallPair]] = seen) -> None:
                 nonlocal done
                 if prepared.frame is not None and prepared.rectified is not None:
-                    small.append(small_frame(prepared.frame, prepared.rectified, times))
+                    frame = replace(prepared.frame, disparity_px=None, blind=_blind(prepared.rectified))
+                    seen.append((frame, small_pair(prepared.rectified, times)))
                 done += 1
                 advance(done)
 
             self._traverses.append(self._read(source, plan, on_frame))
-            traverse = _small_traverse(plan, self._traverses[-1], small, times)
+            traverse = _small_traverse(plan, self._traverses[-1], seen, times)
             self._gradients.append(make_stereo_gradient(traverse, self._target, self._options.loss))
         check_classes(self._traverses, self._truth.target)
 
@@ -134,19 +137,27 @@ class StereoTuningRun:
             JaxmapError: the loss diverges, or writing failed; what was best before is kept.
         """
         history: list[dict[str, float]] = []
+        tried = 0
 
-        def slope(free: FreeMatch) -> tuple[tuple[jax.Array, jax.Array], FreeMatch]:
-            match, pull = jax.vjp(lambda free: matched_by(free, self._start), free)
-            every = [gradient.of(match) for gradient in self._gradients]
-            tuned, held_out = (jnp.stack(values).mean() for values in zip(*(one[0] for one in every), strict=True))
-            total = jax.tree.map(lambda *leaves: jnp.stack(leaves).mean(0), *(one[1] for one in every))
-            return (tuned, held_out), pull(total)[0]
+        def losses(free: FreeMatch) -> tuple[tuple[jax.Array, jax.Array], list[jax.Array]]:
+            every = [gradient.losses(matched_by(free, self._start)) for gradient in self._gradients]
+            tuned, held_out = (jnp.stack(values).mean() for values in zip(*(both for both, _ in every), strict=True))
+            return (tuned, held_out), [cotangent for _, cotangent in every]
+
+        def pull(free: FreeMatch, cotangents: list[jax.Array]) -> FreeMatch:
+            match, back = jax.vjp(lambda free: matched_by(free, self._start), free)
+            every = [one.pull(match, mine) for one, mine in zip(self._gradients, cotangents, strict=True)]
+            return back(jax.tree.map(lambda *leaves: jnp.stack(leaves).mean(0), *every))[0]
 
         def on_step(step: Step) -> None:
-            history.append({"step": step.number, "loss": step.losses.tuned, "held_out": step.losses.held_out})
+            nonlocal tried
+            tried = step.number
+            if step.taken:
+                history.append({"step": step.number, "loss": step.losses.tuned, "held_out": step.losses.held_out})
             if step.best:
                 self._write_config(matched_by(step.free, self._start))
-            advance(step.number, f"loss {step.losses.tuned:.4f}, held out {step.losses.held_out:.4f}")
+            note = "" if step.taken else ": taken back"
+            advance(step.number, f"loss {step.losses.tuned:.4f}, held out {step.losses.held_out:.4f}{note}")
 
         start = free_match(self._start)
         frozen = self._options.frozen
@@ -154,10 +165,11 @@ class StereoTuningRun:
             name: jax.tree.map(lambda leaf, name=name: jnp.full_like(leaf, name not in frozen), leaves)
             for name, leaves in start.items()
         }
-        best = follow(slope, start, self._options.descent, moves=moves, on_step=on_step)
+        best = go_down(Slope(losses, pull), start, self._options.descent, moves=moves, on_step=on_step)
         after = matched_by(best.free, self._start)
         self._write_config(after)
-        record = {"name": "tuned", "best_step": best.number, "parameters": _plain(after), "history": history}
+        record = {"name": "tuned", "best_step": best.number, "tried": tried, "history": history}
+        record |= {"parameters": _plain(after)}
         old = [self._score(one, one, plan) for one, plan in zip(self._traverses, self._plans, strict=True)]
         record |= scores_of_parts(self._traverses, old, self._scores_after(after), self._options.seed)
         read = list(zip(self._sources, self._plans, self._traverses, strict=True))
@@ -178,13 +190,19 @@ class StereoTuningRun:
         return score_cells(replace(now, arrays=arrays, groups=before.groups), params, self._target)
 
     def _numbers(self, match: MatchParams, out: Path) -> dict[str, Any]:
-        """The stereo options that are tuned."""
+        """The stereo options that are tuned, with the weights in a file beside `out`; they are written already."""
         numbers = {
             "step_penalty": float(f"{float(match.p1):.6g}"),
             "jump_penalty": float(f"{float(match.p2):.6g}"),
             "uniqueness_ratio": round(100 * float(match.uniqueness)),
         }
-        return numbers | ({"cost_network": out.with_suffix(".safetensors").absolute()} if match.cost else {})
+        if not match.cost:
+            return numbers
+        sha256 = hashlib.sha256(self._out.with_suffix(".safetensors").read_bytes()).hexdigest()
+        return numbers | {
+            "cost_network": out.with_suffix(".safetensors").absolute(),
+            "cost_network_sha256": sha256,
+        }
 
     def _write_config(self, match: MatchParams) -> None:
         if match.cost:
@@ -214,21 +232,24 @@ def _matcher(plan: Plan) -> JaxMatcher:
     return plan.front_end.matcher
 
 
-def _small_traverse(plan: Plan, scored: Traverse, frames: list[Frame], times: int) -> StereoTraverse:
-    """The traverse with small frames, and a step that matches them softly."""
-    camera = small_camera(plan.front_end.camera, times)
-    poses = plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified
+def _blind(rectified: RectifiedFrame) -> jax.Array:
+    """The pixels that have no disparity, whatever is matched; of the same form for every frame."""
+    return to_device(np.zeros(rectified.left.shape[:2], bool) if rectified.blind is None else rectified.blind)
+
+
+def _small_traverse(plan: Plan, scored: Traverse, frames: list[tuple[Frame, SmallPair]], times: int) -> StereoTraverse:
+    """The traverse with small pairs, and a step that matches them softly."""
+    camera, matcher = plan.front_end.camera, _matcher(plan)
     mapper = make_mapper(
         camera,
         plan.grid,
         plan.labeller,
         plan.rule,
         plan.depth_range_m,
-        match=small_design(_matcher(plan).design, times),
-        T_world_camera=poses,
+        match=small_design(matcher.design, camera.width_px * camera.height_px, times),
+        T_world_camera=plan.sequence.T_world_camera @ plan.front_end.T_raw_rectified,
     )
-    params = replace(plan.params, camera=camera, match=_matcher(plan).params)
-    return StereoTraverse(scored, mapper, frames, params, plan.key, times)
+    return StereoTraverse(scored, mapper, frames, replace(plan.params, match=matcher.params), plan.key, times)
 
 
 def _plain(match: MatchParams) -> dict[str, float]:

@@ -450,6 +450,9 @@ def descent_notes(stage: Mapping[str, Any]) -> list[str]:
         stage: as the JSON of `jaxmap tune` has it.
     """
     first, last = stage["history"][0], stage["history"][-1]
+    if first is last:
+        tried = f"{stage['tried']} steps tried, from --learning-rate down"
+        return [f"{stage['name']}: the loss falls nowhere around the start, whose numbers are kept ({tried})"]
     grown = last["loss"] > first["loss"]
     if stage["best_step"] and not grown:
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import partial
 from threading import Lock
 
@@ -9,9 +10,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
+from jaxmap.errors import UsageError
 from jaxmap.matching.design import Cost, MatchDesign, MatchParams, make_match_params
 from jaxmap.matching.match import match
-from jaxmap.matching.mccnn import load_cost_network
+from jaxmap.matching.mccnn import load_cost_network, packaged_weights
 from jaxmap.stereo.match import Matcher, StereoOptions, check_same_size
 from jaxmap.types import to_device
 
@@ -33,6 +35,7 @@ class JaxMatcher:
         design: what is fixed before it is compiled: with the first pair.
         params: its numbers.
         num_disparities: how many disparities are searched.
+        network_sha256: SHA-256 of the file of the cost network; None where there is none.
     """
 
     def __init__(self, options: StereoOptions, width_px: int) -> None:
@@ -40,10 +43,12 @@ class JaxMatcher:
 
         Raises:
             JaxmapError: the weights of the cost network cannot be read.
+            UsageError: they are not those that the options name by their SHA-256.
         """
         self.options = options
         self.design, self.params = match_design(options, width_px), match_params(options)
         self.num_disparities = self.design.num_disparities
+        self.network_sha256 = _network_sha256(options)
         self._lock = Lock()
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -88,6 +93,21 @@ def match_params(options: StereoOptions) -> MatchParams:
         temperature=options.temperature,
         weights=weights,
     )
+
+
+def _network_sha256(options: StereoOptions) -> str | None:
+    """That of the file of the cost network, held against what the options name."""
+    if options.matcher != "mccnn":
+        return None
+    path = options.cost_network or packaged_weights()
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    if options.cost_network_sha256 is not None and options.cost_network_sha256.lower() != sha256:
+        raise UsageError(
+            f"the cost network's SHA-256 does not start with {options.cost_network_sha256[:16]}",
+            where=path,
+            fix="give the weights of that run, or leave out stereo.cost_network_sha256",
+        )
+    return sha256
 
 
 def match_design(options: StereoOptions, width_px: int) -> MatchDesign:

@@ -60,6 +60,8 @@ class StereoOptions:
     cost_network: Path | None = None
     """matcher mccnn: a file of the network's weights (.safetensors, .pt, .onnx); by default those that come with the
     package mccnn."""
+    cost_network_sha256: str | None = None
+    """matcher mccnn: SHA-256 that this file must have; the config.yaml of a run records it."""
     mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
     """Paths of the cost aggregation: three, five (sgbm), eight (hh) or four (hh4)."""
     min_disparity_px: Annotated[int, count(1024, least=-1024)] = 0
@@ -119,7 +121,7 @@ class StereoOptions:
     def _refuse_what_means_nothing(self) -> None:
         """Refuses options that differ from their defaults and belong to another matcher."""
         others = _OF_OPENCV if self.matcher != "opencv" else _OF_STEP
-        others += ("cost", "block_size") if self.matcher == "mccnn" else ("cost_network",)
+        others += ("cost", "block_size") if self.matcher == "mccnn" else ("cost_network", "cost_network_sha256")
         for one in fields(self):
             if one.name in others and getattr(self, one.name) != one.default:
                 raise _bad(

@@ -1,4 +1,8 @@
-"""Gradient descent with a held-out loss: the best parameters are kept at every step, and it stops when they stay."""
+"""Gradient descent with a held-out loss: the best parameters are kept at every step, and it stops when they stay.
+
+`descend` takes every step of Adam: for smooth, cheap losses. `go_down` takes only steps under which the loss
+falls: for one that has small jumps of its own, which no gradient knows of.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +27,16 @@ class Losses(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Where the descent stands: the step, its losses, the parameters, and whether they are the best so far."""
+    """Where the descent stands: the step, its losses, the parameters, and whether they are the best so far.
+
+    `taken` is false where the descent goes back from there.
+    """
 
     number: int
     losses: Losses
     free: PyTree
     best: bool
+    taken: bool = True
 
 
 def descend(
@@ -55,22 +63,6 @@ def descend(
             handed to `on_step`.
     """
     slope = jax.jit(jax.value_and_grad(loss, has_aux=True))
-    return follow(lambda free: slope(free, *data), start, options, moves=moves, on_step=on_step)
-
-
-def follow(
-    slope: Callable[[PyTree], tuple[tuple[jax.Array, jax.Array], PyTree]],
-    start: PyTree,
-    options: DescentOptions,
-    *,
-    moves: PyTree | None = None,
-    on_step: Callable[[Step], None] = lambda step: None,
-) -> Step:
-    """The same along any gradient: `slope` gives both losses, and the gradient of the first.
-
-    Raises:
-        JaxmapError: as of `descend`.
-    """
     schedule = optax.cosine_decay_schedule(options.learning_rate, options.steps)
     optimiser = optax.chain(optax.clip_by_global_norm(options.max_norm), optax.adam(schedule))
 
@@ -85,7 +77,7 @@ def follow(
     free, state = start, optimiser.init(start)
     best, first = None, math.inf
     for number in range(options.steps + 1):
-        (tuned, held_out), gradient = slope(free)
+        (tuned, held_out), gradient = slope(free, *data)
         moved, state, finite = advance(free, state, gradient)
         losses = Losses(float(tuned), float(held_out))
         if number == 0:
@@ -107,3 +99,92 @@ def follow(
         free = moved
     assert best is not None
     return best
+
+
+class Slope(NamedTuple):
+    """A loss and its gradient, apart: `losses` of free numbers, and what `pull` makes their gradient of."""
+
+    losses: Callable[[PyTree], tuple[tuple[jax.Array, jax.Array], PyTree]]
+    pull: Callable[[PyTree, PyTree], PyTree]
+
+
+LEAST_SHARE = 1 / 64
+"""`go_down` ends where no step of this share of the learning rate leads down."""
+
+
+def go_down(
+    slope: Slope,
+    start: PyTree,
+    options: DescentOptions,
+    *,
+    moves: PyTree | None = None,
+    on_step: Callable[[Step], None] = lambda step: None,
+) -> Step:
+    """Descends along the gradient, each number scaled by its root mean square, wherever the loss falls.
+
+    The first step is `learning_rate` for every number. A step that leads up is taken back and halved; after one that
+    leads down the next is twice as long. A loss that is not finite leads up.
+
+    Args:
+        slope: the loss and its gradient.
+        start: free numbers.
+        options: `steps` are losses, taken back or not; `patience` counts those without a better held-out loss.
+        moves: as of `descend`.
+        on_step: is called after every loss.
+
+    Returns:
+        The step of the least held-out loss among those taken; the first one is the start itself.
+
+    Raises:
+        JaxmapError: the loss or its gradient at the start, or a gradient later, is not finite.
+    """
+    scale = optax.scale_by_rms(decay=0.9, eps=1e-12, bias_correction=True)
+
+    @jax.jit
+    def direction(gradient: PyTree, state: PyTree) -> tuple[PyTree, PyTree, jax.Array]:
+        if moves is not None:
+            gradient = jax.tree.map(jnp.multiply, gradient, moves)
+        finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all()
+        return *scale.update(gradient, state), finite
+
+    def evaluated(number: int, free: PyTree, above: float) -> tuple[Step, PyTree]:
+        (tuned, held_out), kept = slope.losses(free)
+        losses = Losses(float(tuned), float(held_out))
+        taken = math.isfinite(losses.tuned + losses.held_out) and losses.tuned < above
+        better = taken and (best is None or losses.held_out < best.losses.held_out)
+        return Step(number, losses, free, better, taken), kept
+
+    def downhill(at: Step, kept: PyTree, state: PyTree) -> tuple[PyTree, PyTree]:
+        way, state, finite = direction(slope.pull(at.free, kept), state)
+        if not finite:
+            raise _not_finite("the gradient", at)
+        return way, state
+
+    best: Step | None = None
+    here, kept = evaluated(0, start, math.inf)
+    if not here.taken:
+        raise _not_finite("the loss", here)
+    best = here
+    on_step(here)
+    way, state = downhill(here, kept, scale.init(start))
+    rate = options.learning_rate
+    for number in range(1, options.steps + 1):
+        there = jax.tree.map(lambda x, d, rate=rate: x - rate * d, here.free, way)
+        tried, kept = evaluated(number, there, here.losses.tuned)
+        on_step(tried)
+        best = tried if tried.best else best
+        rate *= 2.0 if tried.taken else 0.5
+        if number - best.number >= options.patience or rate < options.learning_rate * LEAST_SHARE:
+            break
+        if tried.taken and number < options.steps:
+            here = tried
+            way, state = downhill(here, kept, state)
+    return best
+
+
+def _not_finite(what: str, at: Step) -> JaxmapError:
+    return JaxmapError(
+        f"{what} is not finite: loss {at.losses.tuned:g}, held out {at.losses.held_out:g}, after {at.number} steps",
+        where="tuning",
+        fix="start from other numbers, or tune on other frames",
+    )

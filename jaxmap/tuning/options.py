@@ -16,12 +16,13 @@ BLOCK_PX = 4
 
 @options("tuning")
 class DescentOptions:
-    """The optimiser: Adam, its learning rate falling to zero along a half cosine."""
+    """The optimiser: Adam, its learning rate falling to zero along a half cosine; through stereo see `go_down`."""
 
     steps: Annotated[int, count(1_000_000)] = 150
     """Steps of descent, at most."""
     learning_rate: Annotated[float, Positive] = 0.05
-    """Of the descent, in units of the unconstrained numbers; the least, if the loss diverges."""
+    """Of the descent, in units of the unconstrained numbers; the least, if the loss diverges. Through stereo only steps
+    are taken under which the loss falls, and this is the first one."""
     patience: Annotated[int, count(1_000_000)] = 40
     """Stop after so many steps without a better held-out loss."""
     max_norm: Annotated[float, Positive, tyro.conf.Suppress] = 10.0
@@ -71,7 +72,8 @@ class TuneOptions:
     """What is tuned: the numbers of fusion and labels, or those of stereo matching (penalties, uniqueness, the weights
     of a cost network) by the map that comes out; --stereo.matcher then is sgm or mccnn."""
     smaller: Literal[1, 2, 4] = 2
-    """Through stereo: match images so many times smaller while tuning; scores are of full size."""
+    """Through stereo: match images so many times smaller while tuning; they are mapped and scored at full size. 1
+    resembles the map most and is for a GPU."""
     held_out_share: Annotated[float, Interval(gt=0, lt=1)] = 0.25
     """Share of the ground that is held out, in blocks of 2 m and whole rocks."""
     kernel: Literal[0, 3, 5, 7, 9] = 0

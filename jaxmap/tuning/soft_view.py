@@ -65,7 +65,7 @@ def columns_of_list(column: Int[Array, "V"], shape: tuple[int, int]) -> Columns:
 
 def soft_columns(
     log_odds: Float[Array, "K *v"],
-    observed: Bool[Array, "*v"],
+    observed: Bool[Array, "*v"] | Float[Array, "*v"],
     columns: Columns,
     params: FusionParams,
     rule: FusionRule,
@@ -77,7 +77,7 @@ def soft_columns(
 
     Args:
         log_odds: evidence of voxels, occupancy first; of a grid, or of a list.
-        observed: voxels that any frame touched; the others hold zeros.
+        observed: voxels that any frame touched, or how much they were, between 0 and 1; the others hold zeros.
         columns: how they make columns.
         params: how evidence is read.
         rule: `column` and the priority of classes.
@@ -86,9 +86,9 @@ def soft_columns(
         softness: widths of the decisions.
     """
     margin = (log_odds[0] + params.occupancy_prior - _logit(params.occupancy_threshold)) / softness.occupied
-    solid = jnp.where(observed, jax.nn.sigmoid(margin), 0.0)
+    solid = observed * jax.nn.sigmoid(margin)
     # 1 - prod(1 - solid), whose gradient stays finite where a voxel is certain.
-    seen = -jnp.expm1(-columns.total(jnp.where(observed, jax.nn.softplus(margin), 0.0)))
+    seen = -jnp.expm1(-columns.total(observed * jax.nn.softplus(margin)))
 
     def read(index: int) -> Array:
         evidence = log_odds[1 + index]
@@ -97,7 +97,7 @@ def soft_columns(
         else:
             # The weight as log-odds: a voxel that is hardly there cannot be the greatest.
             weighed = evidence + jax.nn.log_sigmoid(margin)
-            column = columns.greatest(jnp.where(observed, weighed, _FAR_BELOW))
+            column = columns.greatest(jnp.where(observed > 0, weighed, _FAR_BELOW))
             column = jnp.where(column > 0.5 * _FAR_BELOW, column, 0.0)
         if params.class_kernel is not None:
             column = spread_evidence(column[None], params.class_kernel[index][None])[0]

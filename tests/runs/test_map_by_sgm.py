@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 
 import numpy as np
 import pytest
 from fixtures import cli, map_words, scene_folder, shared_cache  # noqa: F401
 from planned_runs import config_of, log_odds, planned
+from safetensors.numpy import save_file
 from scenes import scene_frame
 
+from jaxmap.errors import UsageError
+from jaxmap.host.output_folder import check_same_settings
 from jaxmap.mapping.observations import open_observations
+from jaxmap.runs.config import load_config
 from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.mapping_plan import plan_run
 from jaxmap.stereo.jax_matcher import JaxMatcher
@@ -82,6 +87,50 @@ def test_a_run_goes_on_with_its_matcher_alone(scene_folder, cli, tmp_path):
     assert "matcher: sgm" in (tmp_path / "config.yaml").read_text()
     error = cli(*map_words(scene_folder, tmp_path), "--stop", 2, "--resume").error
     assert "stereo.matcher" in error
+
+
+def write_cost_network(path, seed: int) -> str:
+    """A small network of random weights; gives the file's SHA-256."""
+    rng = np.random.default_rng(seed)
+    tensors = {"conv_blocks.0.weight": rng.normal(size=(4, 1, 3, 3)), "conv_blocks.0.bias": np.zeros(4)}
+    save_file({name: values.astype(np.float32) for name, values in tensors.items()}, path)
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_weights_swapped_under_one_name_are_noticed(scene_folder, tmp_path):
+    weights, run = tmp_path / "cost.safetensors", RunFolder(tmp_path / "run")
+    sha256 = write_cost_network(weights, 1)
+    stereo = {"matcher": "mccnn", "cost_network": str(weights)}
+    config = config_of(stereo=stereo, stop=2)
+    plan = planned(scene_folder, stereo=stereo, stop=2)
+    assert plan.settings(config)["stereo"]["cost_network_sha256"] == sha256
+    run.begin(plan.settings(config), resume=False, overwrite=False)
+    for again in ({}, {"cost_network_sha256": sha256.upper()}):
+        planned(scene_folder, stereo=stereo | again, stop=2)
+    check_same_settings(run.config, planned(scene_folder, stereo=stereo, stop=2).settings(config))
+
+    write_cost_network(weights, 2)
+    with pytest.raises(UsageError, match="begun with another stereo.cost_network_sha256"):
+        check_same_settings(run.config, planned(scene_folder, stereo=stereo, stop=2).settings(config))
+    recorded = load_config(str(run.config)).stereo.cost_network_sha256
+    with pytest.raises(UsageError, match="the cost network's SHA-256 does not start with"):
+        planned(scene_folder, stereo=stereo | {"cost_network_sha256": recorded}, stop=2)
+
+
+@pytest.mark.slow
+def test_observations_hold_what_matched_them(scene_folder, cli, tmp_path):
+    weights = tmp_path / "cost.safetensors"
+    sha256 = write_cost_network(weights, 1)
+    words = ("--stop", 2, "--labeller", "plane", "--stereo.matcher", "mccnn", "--stereo.cost-network", weights)
+    assert cli("perceive", scene_folder, "--out", tmp_path / "seen", *words).status == 0
+    settings = open_observations(RunFolder(tmp_path / "seen").observations).attributes.settings
+    assert settings["stereo"]["cost_network_sha256"] == sha256
+    assert cli(*map_words(tmp_path / "seen", tmp_path / "map")).status == 0
+    write_cost_network(weights, 2)
+    outcome = cli(*map_words(tmp_path / "seen", tmp_path / "again"))
+    assert outcome.status == 2 and "cost network's SHA-256" in outcome.error
+    outcome = cli("perceive", scene_folder, "--out", tmp_path / "seen", *words)
+    assert outcome.status != 0 and "cost_network_sha256" in outcome.error
 
 
 @pytest.mark.parametrize(

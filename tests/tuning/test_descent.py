@@ -21,7 +21,7 @@ from jaxmap.evaluation.truth_cells import TruthCells, cell_counts
 from jaxmap.fusion.bijectors import positive
 from jaxmap.fusion.params import make_fusion_params
 from jaxmap.tuning.cell_scores import ScoredCells, calibration_rows, joined, score_with_intervals
-from jaxmap.tuning.descent import descend
+from jaxmap.tuning.descent import LEAST_SHARE, Slope, descend, go_down
 from jaxmap.tuning.options import DescentOptions
 from jaxmap.tuning.parametrisation import TunedParams, constrained, unconstrained
 from jaxmap.tuning.split import ground_groups, hold_out
@@ -74,6 +74,51 @@ def test_a_loss_that_is_not_finite_is_told_and_what_was_best_is_kept(after):
         descend(breaking, jnp.array([0.1]), QUICK, on_step=steps.append)
     assert bool(steps) == bool(after)
     assert all(np.isfinite(step.losses.tuned) for step in steps)
+
+
+def slope_of(loss):
+    """A loss for `go_down`, its gradient taken apart."""
+    return Slope(lambda free: (loss(free), free), lambda free, kept: jax.grad(lambda free: loss(free)[0])(kept))
+
+
+@given(start=st.floats(-5, 5), rough=st.floats(0, 0.3), rate=st.floats(0.01, 3))
+def test_going_down_never_goes_up(start, rough, rate):
+    """However rough the loss and however long the first step."""
+
+    def loss(free):
+        value = ((free - 1.0) ** 2).sum() + rough * jnp.floor(jnp.sin(40.0 * free) * 2.0).sum()
+        return value, value
+
+    steps = []
+    options = replace(QUICK, steps=20, learning_rate=rate)
+    best = go_down(slope_of(loss), jnp.array([start]), options, on_step=steps.append)
+    losses = [step.losses.tuned for step in steps if step.taken]
+    assert losses == sorted(set(losses), reverse=True)
+    assert best.losses.tuned == losses[-1] and [step.number for step in steps] == list(range(len(steps)))
+
+
+def test_going_down_finds_the_bottom_whatever_the_rate():
+    for rate in (1e-3, 1.0, 30.0):
+        best = go_down(slope_of(bowl), jnp.array([-2.0, 4.0]), replace(QUICK, learning_rate=rate, steps=120))
+        np.testing.assert_allclose(best.free, [0.8, 0.8], atol=0.25)
+
+
+def test_where_nothing_leads_down_it_says_so_by_its_first_step():
+    steps = []
+    best = go_down(slope_of(lambda free: ((free * free).sum(),) * 2), jnp.zeros(2), QUICK, on_step=steps.append)
+    assert best.number == 0 and not any(step.taken for step in steps[1:])
+    assert 2.0 ** -(len(steps) - 2) >= LEAST_SHARE > 2.0 ** -(len(steps) - 1)
+
+
+def test_going_down_turns_back_from_what_is_not_finite_and_keeps_what_shall_stay():
+    def loss(free):
+        value = jnp.where((free > 1.5).any(), jnp.nan, -free.sum())
+        return value, value
+
+    best = go_down(slope_of(loss), jnp.zeros(2), QUICK, moves=jnp.array([1.0, 0.0]))
+    assert best.free[1] == 0.0 and 1.4 < best.free[0] <= 1.5
+    with pytest.raises(JaxmapError, match="the loss is not finite.*after 0 steps"):
+        go_down(slope_of(loss), jnp.full(2, 2.0), QUICK)
 
 
 def test_a_loss_that_grows_a_hundredfold_diverges():

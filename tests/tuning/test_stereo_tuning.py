@@ -21,7 +21,7 @@ from tune_faults import tune_words, write_truth
 from jaxmap.evaluation.cells import column_shares, make_cells
 from jaxmap.fusion.options import FusionRule
 from jaxmap.fusion.params import make_fusion_params
-from jaxmap.geometry.camera import points_to_pixels
+from jaxmap.fusion.sensor_model import frame_evidence
 from jaxmap.labellers.files import make_files_labeller
 from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.step import MapperParams, make_mapper
@@ -31,11 +31,11 @@ from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.tuning.evidence_cache import CacheRecipe
 from jaxmap.tuning.map_loss import MapTruth
 from jaxmap.tuning.options import MapLossOptions
-from jaxmap.tuning.small_frames import small_camera, small_design, small_frame
-from jaxmap.tuning.stereo_evidence import StereoTraverse, make_stereo_gradient
+from jaxmap.tuning.small_frames import SmallPair, at_full_size, small_design, small_pair
+from jaxmap.tuning.stereo_evidence import StereoTraverse, make_stereo_gradient, soft_misses, stereo_losses
 from jaxmap.tuning.stereo_params import free_match, matched_by
 from jaxmap.tuning.traverse_loss import Traverse, TraverseArrays
-from jaxmap.types import Frame, make_grid, make_stereo_camera
+from jaxmap.types import Frame, make_grid
 
 THROUGH = ("--through", "stereo", "--stereo.matcher", "sgm")
 EVERY_PX = 4
@@ -67,7 +67,7 @@ def small_traverse() -> StereoTraverse:
         pose = jaxlie.SE3.from_matrix(jnp.asarray(seen.T_world_camera, jnp.float32))
         grey = [jnp.asarray(image, jnp.float32).reshape(*image.shape[:2], -1).mean(-1) for image in images]
         soft = jnp.asarray(labels, jnp.float32)
-        frames.append(Frame(None, pose, image=grey[0], right_image=grey[1], class_probabilities=soft))
+        frames.append((Frame(None, pose, class_probabilities=soft), SmallPair(*grey)))
     cells = make_cells(grid, 0.4)
     shape = grid.shape[:2]
     truly = jnp.asarray(rng.uniform(size=shape) < 0.4, jnp.float32)
@@ -77,7 +77,7 @@ def small_traverse() -> StereoTraverse:
     arrays = TraverseArrays(None, truth, held_out)  # type: ignore[arg-type]
     scored = Traverse("scene", recipe, arrays, np.zeros(shape, np.int32), 0.5)
     params = MapperParams(camera, make_fusion_params(ROVER_CLASSES), match=make_match_params(temperature=0.05))
-    return StereoTraverse(scored, mapper, frames, params, jax.random.key(0), EVERY_PX)
+    return StereoTraverse(scored, mapper, frames, params, jax.random.key(0), 1)
 
 
 @pytest.mark.slow
@@ -101,6 +101,32 @@ def test_the_gradient_is_that_of_the_loss():
             assert abs(float(difference)) > 0
 
 
+def test_less_than_a_point_takes_less_than_a_whole_one_from_being_free():
+    fusion = make_fusion_params(ROVER_CLASSES)
+    points = jnp.array([0.0, 1e-4, 0.5, 1.0, 9.0])
+    counts = jnp.zeros((len(ROVER_CLASSES) + 1, 1, 1, 5)).at[1, 0, 0].set(points)
+    free = jnp.ones((1, 1, 5), bool)
+    miss = fusion.occupancy_miss - fusion.occupancy_prior
+    np.testing.assert_allclose(
+        soft_misses(counts, free, fusion)[0, 0], miss * np.array([1, 1 - 1e-4, 0.5, 0, 0]), rtol=1e-5
+    )
+    assert not soft_misses(counts, ~free, fusion).any()
+    # With whole points or none it is what the step takes.
+    hard = frame_evidence(counts, free, fusion, FusionRule())[0] - frame_evidence(counts, None, fusion, FusionRule())[0]
+    np.testing.assert_allclose(soft_misses(counts, free, fusion)[..., [0, 3, 4]], hard[..., [0, 3, 4]], atol=1e-6)
+
+
+def test_a_trace_of_evidence_changes_the_loss_by_a_trace():
+    """A share of a point that comes near a voxel, and nothing, are about the same."""
+    traverse = small_traverse()
+    target, options = ROVER_CLASSES.index("rock"), MapLossOptions()
+    log_odds = jnp.zeros_like(traverse.mapper.init().log_odds).at[:, ::2].set(1.0)
+    trace = jnp.where(log_odds == 0, 1e-4, log_odds)
+    np.testing.assert_allclose(
+        stereo_losses(trace, traverse, target, options), stereo_losses(log_odds, traverse, target, options), atol=5e-3
+    )
+
+
 @given(numbers=st.tuples(*[st.floats(-9, 9, width=32)] * 3))
 def test_numbers_stay_in_their_ranges(numbers):
     start = make_match_params("census")
@@ -120,37 +146,39 @@ def test_the_start_is_where_the_settings_are():
 
 
 @pytest.mark.parametrize("times", [1, 2, 4])
-def test_a_small_camera_sees_the_same(times):
-    camera = make_stereo_camera(
-        fx_px=300, cx_px=80.5, cy_px=61, baseline_m=0.2, doffs_px=3, width_px=163, height_px=122
-    )
-    point = jnp.array([0.3, -0.2, 2.5])
-    u_px, v_px, disparity_px, _ = points_to_pixels(camera, point)
-    small_u, small_v, small_disparity, _ = points_to_pixels(small_camera(camera, times), point)
-    np.testing.assert_allclose([small_u, small_v], [(u_px + 0.5) / times - 0.5, (v_px + 0.5) / times - 0.5], rtol=1e-5)
-    np.testing.assert_allclose(small_disparity, disparity_px / times, rtol=1e-5)
-
-
-def test_a_small_design_searches_the_same_depths():
-    design = MatchDesign(min_disparity_px=-3, num_disparities=50, speckle_window_px=100, edge_window_px=7, block_size=9)
-    small = small_design(design, 4)
+def test_a_small_design_searches_the_same_depths_and_checks_as_strictly(times):
+    design = MatchDesign(min_disparity_px=-3, num_disparities=50, edge_window_px=7, block_size=9)
+    small = small_design(design, 800 * 256, times)
     assert small.soft
-    assert (small.min_disparity_px, small.min_disparity_px + small.num_disparities) == (-1, 12)
-    assert (small.speckle_window_px, small.edge_window_px, small.block_size) == (6, 1, 3)
+    assert small.min_disparity_px * times <= -3
+    assert (small.min_disparity_px + small.num_disparities) * times >= 47
+    assert small.speckle_window_px == 256 // times**2
+    assert small.edge_step_px * times == design.edge_step_px
+    assert abs(small.block_size * times - 9) <= times and small.block_size % 2 and small.edge_window_px % 2
 
 
-def test_a_small_frame_is_made_of_means():
+def test_as_it_is_a_design_is_only_made_soft():
+    design = MatchDesign(speckle_window_px=100)
+    assert small_design(design, 10_000, 1) == replace(design, soft=True)
+
+
+@pytest.mark.parametrize("times", [1, 2, 4])
+def test_a_shift_of_small_images_is_that_of_large_ones(times):
+    """Matched small and brought to full size, noise that is shifted has its shift, and what is left over has none."""
     rng = np.random.default_rng(3)
-    left, right = (rng.integers(0, 255, (9, 11, 3)).astype(np.uint8) for _ in range(2))
-    labels = jnp.asarray(rng.integers(0, 3, (9, 11)), jnp.uint8)
-    blind = rng.uniform(size=(9, 11)) < 0.5
-    frame = Frame(jnp.zeros((9, 11)), jaxlie.SE3.identity(), labels=labels)
-    small = small_frame(frame, RectifiedFrame(left, right, None, 0.0, 0.0, blind=blind), 2)
-    assert small.disparity_px is None and small.image is not None and small.right_image is not None
-    assert small.image.shape == (4, 5, 3)
-    np.testing.assert_allclose(small.image[1, 2], left[2:4, 4:6].mean((0, 1)), atol=0.51)
-    np.testing.assert_array_equal(small.labels, labels[1:9:2, 1:10:2])
-    np.testing.assert_array_equal(small.blind, blind[1:9:2, 1:10:2])
+    shift, shape = 8, (42, 103)
+    wide = np.repeat(np.repeat(rng.integers(0, 255, (11, 32)), 4, 0), 4, 1)[: shape[0], : shape[1] + shift]
+    wide = wide.astype(np.uint8)
+    pair = small_pair(RectifiedFrame(wide[:, : shape[1]], wide[:, shift:], None, 0.0, 0.0), times)
+    assert pair.left.shape == (shape[0] // times, shape[1] // times)
+    np.testing.assert_allclose(pair.left[1, 2], wide[times : 2 * times, 2 * times : 3 * times].mean(), atol=0.51)
+    same = (np.asarray(pair.left)[:, shift // times :] == np.asarray(pair.right)[:, : -(shift // times)]).mean()
+    assert same == 1.0
+    large = at_full_size(jnp.full(pair.left.shape, shift / times), shape, times) * times
+    known = np.isfinite(large)
+    assert large.shape == shape and (np.asarray(large)[known] == shift).all()
+    assert known[: shape[0] // times * times, : shape[1] // times * times].all()
+    assert known.sum() == pair.left.size * times**2
 
 
 @pytest.mark.parametrize(
@@ -184,8 +212,8 @@ def test_it_writes_what_map_reads(cli, scene_folder, tmp_path):
     told = json.loads(out.with_suffix(".json").read_text())
     (stage,) = told["stages"]
     assert config.stereo.step_penalty == pytest.approx(stage["parameters"]["step_penalty"], abs=1e-5)
-    assert len(stage["history"]) == 3
     losses = [row["loss"] for row in stage["history"]]
-    assert np.isfinite(losses).all() and len(set(losses)) == 3
+    assert stage["tried"] == 2 and np.isfinite(losses).all()
+    assert losses == sorted(set(losses), reverse=True)
     assert stage["scores"]["held_out"]["iou"]["before"] is not None
     assert out.with_suffix(".html").exists() and not out.with_suffix(".safetensors").exists()
