@@ -140,7 +140,8 @@ def test_scripts_are_executable(name: str):
 
 @pytest.mark.parametrize("name", [*EXECUTABLES, "scripts/lib.sh"])
 def test_scripts_parse(name: str):
-    subprocess.run(["bash", "-n", str(ROOT / name)], check=True, capture_output=True, timeout=30)
+    parsed = subprocess.run(["bash", "-n", str(ROOT / name)], capture_output=True, timeout=30)
+    assert parsed.returncode == 0, parsed.stderr
 
 
 def test_the_licence_is_declared_and_there():

@@ -56,7 +56,7 @@ def run_until(
         )
 
 
-def same_run(run: Path, whole: Path) -> None:
+def assert_same_run(run: Path, whole: Path) -> None:
     np.testing.assert_array_equal(log_odds(run), log_odds(whole))
     assert (run / "poses.tum").read_bytes() == (whole / "poses.tum").read_bytes()
     assert (run / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
@@ -81,7 +81,7 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, fini
     outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume"))
     assert outcome.status == 0
     assert index == 0 or f"going on after {index} of {FRAMES} frames" in outcome.err
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
             on_frame=cut_after(4),
         )
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 @pytest.mark.slow
@@ -159,7 +159,7 @@ def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_p
     assert 2 <= _saved_frames(run) < FRAMES
     assert not (run / "metrics.json").exists()
     assert cli(*map_words(scene_folder, run, "--resume")).status == 0
-    same_run(run, finished_run)
+    assert_same_run(run, finished_run)
     assert not [path for path in run.iterdir() if path.name.startswith(".")], "no leftovers"
 
 
@@ -279,7 +279,7 @@ def test_an_overwriting_run_that_was_cut_off_is_gone_on_with(cli, scene_folder, 
     assert outcome.status == 1 and "holds a run already" in outcome.error
     outcome = cli(*map_words(scene_folder, earlier_run, "--resume"))
     assert outcome.status == 0 and "going on after 3" in outcome.err
-    same_run(earlier_run, finished_run)
+    assert_same_run(earlier_run, finished_run)
     assert not [path for path in earlier_run.iterdir() if path.name.startswith(".")]
 
 
@@ -290,13 +290,13 @@ def test_an_overwriting_run_that_is_killed_leaves_the_one_before_it(cli, scene_f
     kill_when((earlier_run / ".new" / "map.zarr").exists, SLOW_DISK, words)
     assert before.items() <= contents(earlier_run).items()
     assert cli(*map_words(scene_folder, earlier_run, "--resume")).status == 0
-    same_run(earlier_run, finished_run)
+    assert_same_run(earlier_run, finished_run)
 
 
 def test_a_run_that_was_whole_when_its_process_was_killed_is_put_in_place(cli, finished_run, earlier_run):
     shutil.copytree(finished_run, earlier_run / ".whole")
     assert cli("report", earlier_run).status == 0
-    same_run(earlier_run, finished_run)
+    assert_same_run(earlier_run, finished_run)
 
 
 @pytest.mark.slow
@@ -314,14 +314,14 @@ def test_a_complete_run_is_gone_on_with_to_the_same_end(cli, scene_folder, finis
     outcome = cli(*map_words(scene_folder, run, "--resume"))
     assert outcome.status == 0
     assert "complete already" in outcome.err
-    same_run(run, finished_run)
+    assert_same_run(run, finished_run)
 
 
 @pytest.mark.slow
 def test_resuming_in_an_empty_folder_starts(cli, scene_folder, finished_run, tmp_path):
     (tmp_path / "run").mkdir()
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 def test_a_damaged_checkpoint_is_an_error_and_is_kept(cli, scene_folder, tmp_path):
@@ -354,7 +354,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(cli, scene_folder, finished_run,
     assert load_map(tmp_path / "run" / "map.zarr")[1].progress["next_index"] == 2
     assert not (tmp_path / "run" / "metrics.json").exists()
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 @pytest.mark.slow
@@ -369,7 +369,7 @@ def test_a_full_disk_at_the_end_leaves_a_map_to_resume(writer, cli, scene_folder
         patched.setattr(jaxmap.runs.mapping, writer, full)
         assert cli(*map_words(scene_folder, tmp_path / "run")).status == 1
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 @pytest.mark.slow
