@@ -192,19 +192,8 @@ def map_on_workers(
 ) -> dict[str, Any]:
     """Maps a sequence on workers: they perceive its frames, then they fuse what was perceived.
 
-    Args:
-        source: the sequence.
-        config: the settings.
-        folder: the run folder.
-        workers: where the tasks run.
-        notify: takes lines for the user.
-        steps: shows progress.
-        resume: go on with a run that was interrupted.
-        overwrite: replace the run that is there.
-        keep: keep the observations.
-
-    Returns:
-        The metrics, as they are in metrics.json.
+    The arguments and what is returned are those of `map_observations`, but that `source` is a sequence; with `keep`,
+    the observations stay in the folder.
 
     Raises:
         JaxmapError: as `map_observations`, and as `run_perception`.
