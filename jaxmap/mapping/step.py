@@ -336,7 +336,7 @@ def make_mapper(
 
 
 def step_functions(fuse: Callable[..., Any]) -> dict[str, Any]:
-    """The `step`, `lower` and `compilations` of a mapper: of this function, whose first argument, the map, is donated."""
+    """The `step`, `lower` and `compilations` of a mapper, of a function whose first argument, the map, is donated."""
 
     def fuse_donated(tensors: _Tensors, rest: VoxelMap, *inputs: Any) -> Any:
         return fuse(replace(rest, **tensors._asdict()), *inputs)

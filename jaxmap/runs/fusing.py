@@ -50,8 +50,10 @@ from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.hazard_layers import add_hazards
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import FrameNumbers, RunLog, numbers_of
-from jaxmap.runs.mapping import Pictures, map_attributes, notes, write_outputs
+from jaxmap.runs.map_in_progress import map_attributes
+from jaxmap.runs.mapping import Pictures, write_outputs
 from jaxmap.runs.mapping_plan import Plan, Sharing, plan_run
+from jaxmap.runs.metrics import notes
 from jaxmap.runs.perceiving import run_perception
 from jaxmap.runs.perceiving_shared import check_shareable, keep_on_workers
 from jaxmap.types import to_device

@@ -143,14 +143,14 @@ def test_a_skipped_frame_is_counted_once_over_a_cut(cli, scene_copy, tmp_path):
 def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_path):
     # The frames are slowed down, so that the process dies in the middle of the run.
     program = (
-        "import sys, time, jaxmap.mapping.sequence, jaxmap.runs.mapping\n"
+        "import sys, time, jaxmap.mapping.devices\n"
         "from jaxmap.commands.main import main\n"
-        "fuse = jaxmap.mapping.sequence.run_sequence\n"
+        "fuse = jaxmap.mapping.devices.run_sequence\n"
         "def slowly(*words, **options):\n"
         "    for result in fuse(*words, **options):\n"
         "        yield result\n"
         "        time.sleep(0.5)\n"
-        "jaxmap.runs.mapping.run_sequence = slowly\n"
+        "jaxmap.mapping.devices.run_sequence = slowly\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
     run = tmp_path / "run"
