@@ -1,11 +1,14 @@
 """Fixtures of the command-line tests: one cache folder, one small sequence, one finished run.
 
-Import them by name into a test module. They are made once for the whole session, whoever asks.
+Import them by name into a test module. They are made once for the whole session, whoever asks; the run by one process
+for all of them.
 """
 
 from __future__ import annotations
 
+import fcntl
 import importlib
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -126,6 +129,11 @@ def _scene_folder(base: Path) -> Path:
 
 @cache
 def _finished_run(base: Path) -> Path:
-    out = base / "finished_run"
-    assert main(map_words(_scene_folder(base), out)) == 0
+    # A process of xdist has a folder of its own in that of the session.
+    session = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    out = session / "finished_run"
+    with open(session / "finished_run.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (out / "metrics.json").exists():
+            assert main(map_words(_scene_folder(base), out)) == 0
     return out
