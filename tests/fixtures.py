@@ -1,7 +1,6 @@
 """Fixtures of the command-line tests: one cache folder, one small sequence, one finished run.
 
-Import them by name into a test module. They are made once for the whole session, whoever asks; the run by one process
-for all of them.
+Import them by name into a test module. They are made once for the whole session, by one of its processes for all.
 """
 
 from __future__ import annotations
@@ -122,18 +121,27 @@ def map_words(sequence: object, out: object, *more: object) -> list[str]:
     return [str(word) for word in ("map", sequence, "--out", out, *GRID, *labelled, *more)]
 
 
+def made_once(base: Path, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that the first process of the session to ask makes; the others wait for it."""
+    # A process of xdist has a folder of its own in that of the session.
+    session = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, made = session / name, session / f"{name}.made"
+    with open(session / f"{name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            make(folder)
+            made.touch()
+    return folder
+
+
 @cache
 def _scene_folder(base: Path) -> Path:
-    return write_folder_sequence(base / "scene", FRAMES)
+    return made_once(base, "scene", lambda folder: write_folder_sequence(folder, FRAMES))
 
 
 @cache
 def _finished_run(base: Path) -> Path:
-    # A process of xdist has a folder of its own in that of the session.
-    session = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    out = session / "finished_run"
-    with open(session / "finished_run.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (out / "metrics.json").exists():
-            assert main(map_words(_scene_folder(base), out)) == 0
-    return out
+    def make(out: Path) -> None:
+        assert main(map_words(_scene_folder(base), out)) == 0
+
+    return made_once(base, "finished_run", make)
