@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,7 @@ DEPENDENCIES = requirements(PROJECT["dependencies"])
 EXTRAS = {name: requirements(lines) for name, lines in PROJECT["optional-dependencies"].items()}
 
 
+@cache
 def third_party_imports(folder: Path) -> dict[str, str]:
     """Distribution -> a file that imports it, for all that is neither Python's nor ours."""
     own = {"jaxmap"} | {path.stem for path in folder.rglob("*.py")}

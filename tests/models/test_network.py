@@ -184,7 +184,8 @@ def test_gradients_equal_finite_differences(make):
     check_gradient(make, lambda model: model(jnp.asarray(images)))
 
 
-@pytest.mark.parametrize("record", [pytest.param(SMALL, marks=slow), folded(SMALL)], ids=["batch norm", "folded"])
+@slow
+@pytest.mark.parametrize("record", [SMALL, folded(SMALL)], ids=["batch norm", "folded"])
 def test_gradients_of_the_decoder_equal_finite_differences(record):
     draw = np.random.default_rng(0)
     coarse, fine = draw.normal(size=(1, 2, 3, 8)), draw.normal(size=(1, 7, 9, 4))

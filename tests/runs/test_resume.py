@@ -56,6 +56,19 @@ def run_until(
         )
 
 
+@pytest.fixture(scope="module")
+def run_cut_at_two(scene_folder, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("cut") / "run"
+    run_until(scene_folder, out, 2)
+    return out
+
+
+@pytest.fixture
+def cut_run(run_cut_at_two, tmp_path) -> Path:
+    """A run that was cut off when two frames were saved."""
+    return Path(shutil.copytree(run_cut_at_two, tmp_path / "run"))
+
+
 def assert_same_run(run: Path, whole: Path) -> None:
     np.testing.assert_array_equal(log_odds(run), log_odds(whole))
     assert (run / "poses.tum").read_bytes() == (whole / "poses.tum").read_bytes()
@@ -112,9 +125,8 @@ def test_an_interrupt_right_after_a_frame_loses_no_picture(cli, scene_folder, fi
 
 
 @pytest.mark.slow
-def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    folder = RunFolder(tmp_path / "run")
+def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, cut_run):
+    folder = RunFolder(cut_run)
     folder.begin(planned(scene_folder).settings(config_of()), resume=True, overwrite=False)
     with pytest.raises(Cut):
         run_plan(
@@ -125,8 +137,8 @@ def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
             notify=lambda line: None,
             on_frame=cut_after(4),
         )
-    assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    assert_same_run(tmp_path / "run", finished_run)
+    assert cli(*map_words(scene_folder, cut_run, "--resume")).status == 0
+    assert_same_run(cut_run, finished_run)
 
 
 @pytest.mark.slow
@@ -170,32 +182,29 @@ def _saved_frames(run: Path) -> int:
         return 0
 
 
-def test_other_settings_are_refused_by_name(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    before = contents(tmp_path / "run")
+def test_other_settings_are_refused_by_name(cli, scene_folder, cut_run):
+    before = contents(cut_run)
     for words, name in (
         (("--fusion.class-hit", "1.1"), "fusion.class_hit"),
         (("--stride", "2"), "stride"),
         (("--plane.threshold-m", "0.2"), "plane.threshold_m"),
     ):
-        outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", *words))
+        outcome = cli(*map_words(scene_folder, cut_run, "--resume", *words))
         assert outcome.status == 2
         assert name in outcome.error
-    assert contents(tmp_path / "run") == before
+    assert contents(cut_run) == before
 
 
 @pytest.mark.slow
-def test_another_sequence_is_refused(cli, scene_folder, scene_copy, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    outcome = cli(*map_words(scene_copy, tmp_path / "run", "--resume"))
+def test_another_sequence_is_refused(cli, scene_copy, cut_run):
+    outcome = cli(*map_words(scene_copy, cut_run, "--resume"))
     assert outcome.status == 2
     assert "sequence" in outcome.error
 
 
 @pytest.mark.slow
-def test_how_often_to_save_is_no_setting_of_the_map(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--checkpoint-every-s", "5"))
+def test_how_often_to_save_is_no_setting_of_the_map(cli, scene_folder, cut_run):
+    outcome = cli(*map_words(scene_folder, cut_run, "--resume", "--checkpoint-every-s", "5"))
     assert outcome.status == 0
 
 
@@ -228,13 +237,12 @@ def test_a_sequence_that_grew_does_not_go_on_in_too_small_a_map(cli, scene_folde
         assert list(shape) == metrics_of(tmp_path / "run")["grid"]["shape"]
 
 
-def test_a_used_folder_is_left_alone(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    before = contents(tmp_path / "run")
-    outcome = cli(*map_words(scene_folder, tmp_path / "run"))
+def test_a_used_folder_is_left_alone(cli, scene_folder, cut_run):
+    before = contents(cut_run)
+    outcome = cli(*map_words(scene_folder, cut_run))
     assert outcome.status == 1
-    assert all(way in outcome.error for way in ("--resume", "--overwrite", str(tmp_path / "run")))
-    assert contents(tmp_path / "run") == before
+    assert all(way in outcome.error for way in ("--resume", "--overwrite", str(cut_run)))
+    assert contents(cut_run) == before
 
 
 @pytest.mark.slow
@@ -300,9 +308,8 @@ def test_a_run_that_was_whole_when_its_process_was_killed_is_put_in_place(cli, f
 
 
 @pytest.mark.slow
-def test_overwriting_and_resuming_exclude_each_other(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--overwrite"))
+def test_overwriting_and_resuming_exclude_each_other(cli, scene_folder, cut_run):
+    outcome = cli(*map_words(scene_folder, cut_run, "--resume", "--overwrite"))
     assert outcome.status == 2, "one of the two is not done"
 
 
@@ -324,15 +331,14 @@ def test_resuming_in_an_empty_folder_starts(cli, scene_folder, finished_run, tmp
     assert_same_run(tmp_path / "run", finished_run)
 
 
-def test_a_damaged_checkpoint_is_an_error_and_is_kept(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 3)
-    chunk = max((tmp_path / "run" / "map.zarr").rglob("*"), key=lambda path: path.stat().st_size * path.is_file())
+def test_a_damaged_checkpoint_is_an_error_and_is_kept(cli, scene_folder, cut_run):
+    chunk = max((cut_run / "map.zarr").rglob("*"), key=lambda path: path.stat().st_size * path.is_file())
     chunk.write_bytes(chunk.read_bytes()[:-20] + bytes(20))
-    before = contents(tmp_path / "run")
-    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume"))
+    before = contents(cut_run)
+    outcome = cli(*map_words(scene_folder, cut_run, "--resume"))
     assert outcome.status == 1
     assert "map.zarr" in outcome.error
-    assert contents(tmp_path / "run") == before
+    assert contents(cut_run) == before
 
 
 @pytest.mark.slow
