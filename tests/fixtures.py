@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import pytest
 import tyro
+from checked_once import check_once
 from scenes import write_folder_sequence
 
 from jaxmap.commands import COMMANDS
@@ -52,6 +53,7 @@ Run = Callable[..., Outcome]
 @pytest.fixture(scope="session", autouse=True)
 def shared_cache() -> Path:
     """Compiled programs are kept here, for all processes of a run; never in the user's cache."""
+    check_once()
     return cache_folder()
 
 
