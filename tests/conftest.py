@@ -85,6 +85,9 @@ PEAKS = pytest.StashKey[dict[str, tuple[float, str]]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if not config.getoption("--all"):
+        # Most programs of the quick tests run once: compiling them in full would take longer than they do.
+        os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     settings.load_profile(("ci-" if os.environ.get("CI") else "") + ("all" if config.getoption("--all") else "quick"))
     config.stash[LEFT_MB], config.stash[PEAK] = 0.0, (0.0, "")
     config.stash[PEAKS] = {}

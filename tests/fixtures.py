@@ -1,11 +1,13 @@
 """Fixtures of the command-line tests: one cache folder, one small sequence, one finished run.
 
-Import them by name into a test module. They are made once for the whole session, whoever asks.
+Import them by name into a test module. They are made once for the whole session, by one of its processes for all.
 """
 
 from __future__ import annotations
 
+import fcntl
 import importlib
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -15,6 +17,7 @@ from typing import NamedTuple
 
 import pytest
 import tyro
+from checked_once import check_once
 from scenes import write_folder_sequence
 
 from jaxmap.commands import COMMANDS
@@ -50,6 +53,7 @@ Run = Callable[..., Outcome]
 @pytest.fixture(scope="session", autouse=True)
 def shared_cache() -> Path:
     """Compiled programs are kept here, for all processes of a run; never in the user's cache."""
+    check_once()
     return cache_folder()
 
 
@@ -119,13 +123,27 @@ def map_words(sequence: object, out: object, *more: object) -> list[str]:
     return [str(word) for word in ("map", sequence, "--out", out, *GRID, *labelled, *more)]
 
 
+def made_once(base: Path, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that the first process of the session to ask makes; the others wait for it."""
+    # A process of xdist has a folder of its own in that of the session.
+    session = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, made = session / name, session / f"{name}.made"
+    with open(session / f"{name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            make(folder)
+            made.touch()
+    return folder
+
+
 @cache
 def _scene_folder(base: Path) -> Path:
-    return write_folder_sequence(base / "scene", FRAMES)
+    return made_once(base, "scene", lambda folder: write_folder_sequence(folder, FRAMES))
 
 
 @cache
 def _finished_run(base: Path) -> Path:
-    out = base / "finished_run"
-    assert main(map_words(_scene_folder(base), out)) == 0
-    return out
+    def make(out: Path) -> None:
+        assert main(map_words(_scene_folder(base), out)) == 0
+
+    return made_once(base, "finished_run", make)

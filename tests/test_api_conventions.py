@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,9 @@ def relative(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-TREES = {relative(path): ast.parse(path.read_text("utf-8")) for path in SOURCES}
+@cache
+def trees() -> dict[str, ast.Module]:
+    return {relative(path): ast.parse(path.read_text("utf-8")) for path in SOURCES}
 
 
 def public_definitions(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, Definition]]:
@@ -151,7 +154,7 @@ RULES: list[Rule] = [
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
 def test_sources_keep_the_rule(rule: Rule):
-    complaints = [f"{path}: {text}" for path, tree in TREES.items() for text in rule(tree, path)]
+    complaints = [f"{path}: {text}" for path, tree in trees().items() for text in rule(tree, path)]
     assert not complaints, "\n".join(complaints)
 
 

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,7 @@ DEPENDENCIES = requirements(PROJECT["dependencies"])
 EXTRAS = {name: requirements(lines) for name, lines in PROJECT["optional-dependencies"].items()}
 
 
+@cache
 def third_party_imports(folder: Path) -> dict[str, str]:
     """Distribution -> a file that imports it, for all that is neither Python's nor ours."""
     own = {"jaxmap"} | {path.stem for path in folder.rglob("*.py")}
@@ -140,7 +142,8 @@ def test_scripts_are_executable(name: str):
 
 @pytest.mark.parametrize("name", [*EXECUTABLES, "scripts/lib.sh"])
 def test_scripts_parse(name: str):
-    subprocess.run(["bash", "-n", str(ROOT / name)], check=True, capture_output=True, timeout=30)
+    parsed = subprocess.run(["bash", "-n", str(ROOT / name)], capture_output=True, timeout=30)
+    assert parsed.returncode == 0, parsed.stderr
 
 
 def test_the_licence_is_declared_and_there():

@@ -18,7 +18,7 @@ CAMERA = dict(fx_px=100.0, cx_px=10.0, cy_px=10.0, baseline_m=0.2, width_px=20, 
 NAN, INF = float("nan"), float("inf")
 
 
-def refused(make, *arguments, says: str, **options) -> None:
+def assert_refused(make, *arguments, says: str, **options) -> None:
     """The factory refuses, in one line that names the fault."""
     with pytest.raises(JaxmapError, match=says) as caught:
         make(*arguments, **options)
@@ -38,7 +38,7 @@ def refused(make, *arguments, says: str, **options) -> None:
     ],
 )
 def test_a_wrong_camera_is_refused(wrong, says):
-    refused(types.make_stereo_camera, **{**CAMERA, **wrong}, where="here", says=says)
+    assert_refused(types.make_stereo_camera, **{**CAMERA, **wrong}, where="here", says=says)
 
 
 @pytest.mark.parametrize(
@@ -55,12 +55,12 @@ def test_a_wrong_camera_is_refused(wrong, says):
     ],
 )
 def test_a_wrong_grid_is_refused(lower, upper, size, says):
-    refused(types.make_grid, lower, upper, size, says=says)
+    assert_refused(types.make_grid, lower, upper, size, says=says)
 
 
 def test_a_map_too_large_for_its_indices_is_refused():
     grid = types.make_grid([0, 0, 0], [2000, 2000, 200], 0.5)
-    refused(
+    assert_refused(
         types.make_voxel_map, grid, CLASSES, says=r"4 channels x 4000 x 4000 x 400 .*larger voxels or a smaller box"
     )
 
@@ -89,7 +89,7 @@ def test_a_map_too_large_for_its_indices_is_refused():
     ],
 )
 def test_wrong_fusion_parameters_are_refused(wrong, says):
-    refused(make_fusion_params, CLASSES, **wrong, says=says)
+    assert_refused(make_fusion_params, CLASSES, **wrong, says=says)
 
 
 def test_increments_are_hit_on_the_diagonal_and_miss_beside_it():

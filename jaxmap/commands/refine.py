@@ -13,17 +13,7 @@ import tyro
 from annotated_types import Interval, MinLen
 
 from jaxmap.commands.console import Console, check_bounds, parse
-from jaxmap.datasets.options import (
-    BagOptions,
-    LengthUnit,
-    Offset,
-    PoseConvention,
-    PosesAre,
-    PosesWorld,
-    QuaternionOrder,
-    TimeUnit,
-)
-from jaxmap.host.settings import Place, count
+from jaxmap.datasets.options import ReadOptions
 
 Adjustable = Literal["poses", "mounting", "baseline", "offset"]
 Positive = Annotated[float, Interval(ge=1e-9, lt=1e4)]
@@ -70,53 +60,19 @@ class RefineArguments:
     """Standard deviation of the disparity offset."""
     max_depth_m: Positive | None = None
     """Farther points are not used; by default those whose depth noise exceeds 0.35 m."""
-    dataset: str = "auto"
-    """The reader, see jaxmap map --help."""
-    poses: Path | None = None
-    """Pose file in place of the sequence's own: TUM, KITTI or EuRoC text; or odometry: estimated from the images."""
-    poses_world: PosesWorld = "auto"
-    """World of the poses: z up, z down (north, east, down), y up, camera-like (y down), or find out."""
-    poses_up: tuple[Offset, Offset, Offset] | None = None
-    """Direction of up in that world, where it is not level, see jaxmap map --help."""
-    pose_convention: PoseConvention = "auto"
-    """Axes that the poses describe, see jaxmap map --help."""
-    poses_are: PosesAre = "T_world_camera"
-    """What takes points into what: the poses of the camera in the world, or the inverse."""
-    quaternion: QuaternionOrder = "auto"
-    """Order of a quaternion in the pose file."""
-    poses_time_unit: TimeUnit = "auto"
-    """Unit of the times in the pose file."""
-    poses_unit: LengthUnit = "m"
-    """Unit of the positions in the pose file."""
-    baseline_unit: LengthUnit = "m"
-    """Unit in which the calibration gives the stereo baseline."""
-    calibration: Path | None = None
-    """Camera file in place of the sequence's own: jaxmap's YAML, or one of OpenCV, ROS, Kalibr or MATLAB."""
-    camera: str | None = None
-    """Which stereo camera, where there are several; Katwijk: loccam (the default) or pancam."""
-    bag: BagOptions = field(default_factory=BagOptions)
-    crs: str | None = None
-    """Coordinate reference system of the poses, such as EPSG:32631."""
     remap: tuple[str, ...] = ()
     """What the values of the orthomosaic mean: 0=unlabelled 7=rock '*=sand', or colours: '#b23c2e=rock'."""
     palette: Path | None = None
     """The same as a YAML file of CODE: CLASS."""
     truth_crs: str | None = None
     """Coordinate reference system of the ground truth, in place of its own."""
-    max_pose_gap_s: Positive = 1.0
-    """Poses farther apart are not interpolated."""
-    start: Annotated[int, Place] = 0
-    """First frame."""
-    stop: Annotated[int, Place] | None = None
-    """Frame to stop before, from the end if negative; by default the end."""
-    stride: Annotated[int, count(2**31 - 1)] = 1
-    """Use every n-th frame."""
     align: bool = False
     """Rectify with an estimated rotation of the right camera, as jaxmap map --stereo.align does."""
     strict: bool = False
     """Stop where the quick check of the sequence finds something that would make a map wrong."""
     overwrite: bool = False
     """Replace an earlier refinement in the folder; it stays until the new one is whole."""
+    reading: Annotated[ReadOptions, tyro.conf.arg(name="")] = field(default_factory=ReadOptions)
 
 
 def main(words: Sequence[str]) -> int:
@@ -124,7 +80,6 @@ def main(words: Sequence[str]) -> int:
     arguments = parse(RefineArguments, "refine", words)
     check_bounds(arguments, "refine")
 
-    from jaxmap.datasets import ReadOptions
     from jaxmap.datasets.label_raster import choose_coding
     from jaxmap.host.cache import keep_compiled_programs
     from jaxmap.runs.evaluation import TruthOptions
@@ -134,27 +89,8 @@ def main(words: Sequence[str]) -> int:
     # A job that is ended (SIGTERM) stops as with Ctrl-C; the best result so far is in the folder.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
-    options = ReadOptions(
-        dataset=arguments.dataset,
-        poses=arguments.poses,
-        poses_world=arguments.poses_world,
-        poses_up=arguments.poses_up,
-        pose_convention=arguments.pose_convention,
-        poses_are=arguments.poses_are,
-        quaternion=arguments.quaternion,
-        poses_time_unit=arguments.poses_time_unit,
-        poses_unit=arguments.poses_unit,
-        baseline_unit=arguments.baseline_unit,
-        calibration=arguments.calibration,
-        camera=arguments.camera,
-        bag=arguments.bag,
-        crs=arguments.crs,
-        max_pose_gap_s=arguments.max_pose_gap_s,
-        start=arguments.start,
-        stop=arguments.stop,
-        stride=arguments.stride,
-    )
-    inputs = (arguments.poses, arguments.calibration, arguments.dem, arguments.palette, *arguments.ground_truth)
+    reading = arguments.reading
+    inputs = (reading.poses, reading.calibration, arguments.dem, arguments.palette, *arguments.ground_truth)
     check_inputs_apart(arguments.sequence, arguments.out, inputs)
     truth = TruthOptions(coding=choose_coding(arguments.remap, arguments.palette), crs=arguments.truth_crs)
     files = GroundFiles(arguments.ground_truth, truth, arguments.dem, arguments.ground_below_camera_m)
@@ -162,7 +98,7 @@ def main(words: Sequence[str]) -> int:
         content = run_refine(
             arguments.sequence,
             arguments.out,
-            options,
+            reading,
             _prior(arguments),
             files,
             max_depth_m=arguments.max_depth_m,

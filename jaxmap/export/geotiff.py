@@ -95,13 +95,13 @@ def _described(source: Source) -> _Raster:
 
 
 def _parts(source: Source) -> Iterator[_Part]:
-    for columns in source.columns():
-        top = columns.top
+    for part in source.parts():
+        top = part.top
         label = np.where(top.label == IGNORE, np.nan, top.label)
         bands = [label, np.asarray(top.height_m, np.float64) + source.site_origin[2]]
         bands += [np.where(top.observed, probability, np.nan) for probability in top.probability]
-        layers = absolute(columns.layers, source.site_origin[2])
-        yield columns.corner, np.stack([*bands, *layers.values()]).astype(np.float32)
+        layers = absolute(part.layers, source.site_origin[2])
+        yield part.corner, np.stack([*bands, *layers.values()]).astype(np.float32)
 
 
 def _write(temporary: Path, path: Path, described: _Raster, parts: Iterable[_Part]) -> None:

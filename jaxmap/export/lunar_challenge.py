@@ -37,19 +37,19 @@ def write_lunar_challenge(source: Source, path: Path) -> None:
     height_m = np.full((samples, samples), np.nan)
     rock = np.zeros((samples, samples), bool)
     seen = 0
-    for columns in source.columns():
+    for part in source.parts():
         # The columns that the sample points lie in.
         picked, at = [], []
-        for axis, (start, size) in enumerate(zip(columns.corner, columns.top.observed.shape, strict=True)):
+        for axis, (start, size) in enumerate(zip(part.corner, part.top.observed.shape, strict=True)):
             index = np.floor((along_m - source.corner_m[axis]) / source.size_m[axis] + 1e-9).astype(int) - start
             within = np.flatnonzero((index >= 0) & (index < size))
             picked.append(index[within])
             at.append(within)
-        observed = np.asarray(columns.top.observed)
-        part, place = np.ix_(*picked), np.ix_(*at)
-        height_m[place] = np.where(observed, columns.height_m, np.nan)[part]
-        label = np.asarray(columns.top.label)
-        rock[place] = label[part] == source.target
+        observed = np.asarray(part.top.observed)
+        inner, place = np.ix_(*picked), np.ix_(*at)
+        height_m[place] = np.where(observed, part.height_m, np.nan)[inner]
+        label = np.asarray(part.top.label)
+        rock[place] = label[inner] == source.target
         seen += int(observed.sum())
     known = ~np.isnan(height_m)
     if not known.any():

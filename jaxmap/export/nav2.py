@@ -43,11 +43,11 @@ def write_nav2(source: Source, map_yaml: Path, map_image: Path, costs_yaml: Path
     corner, shape = box
     corner_m = source.corner_m[:2] + np.asarray(corner) * source.size_m[:2]
     obstacles, greys = np.full(shape, UNKNOWN, np.uint8), np.zeros((*shape, 2), np.uint8)
-    for columns in source.columns():
-        x, y = np.argwhere(columns.top.observed).T
-        to = columns.moved(x, y, corner)
-        obstacles[to] = np.where(np.asarray(columns.top.label)[x, y] == source.target, OCCUPIED, FREE)
-        greys[to] = _scaled(_costs(columns, source.target)[x, y])
+    for part in source.parts():
+        x, y = np.argwhere(part.top.observed).T
+        to = part.moved(x, y, corner)
+        obstacles[to] = np.where(np.asarray(part.top.label)[x, y] == source.target, OCCUPIED, FREE)
+        greys[to] = _scaled(_costs(part, source.target)[x, y])
     for image, settings, pixels, mode in (
         (map_image, map_yaml, obstacles, "trinary"),
         (costs_image, costs_yaml, greys, "scale"),
@@ -68,10 +68,10 @@ def write_nav2(source: Source, map_yaml: Path, map_image: Path, costs_yaml: Path
             temporary.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def _costs(columns: TopDownPart, target: int) -> Float[np.ndarray, "X Y"]:
+def _costs(part: TopDownPart, target: int) -> Float[np.ndarray, "X Y"]:
     """Costs from 0 to 1, NaN where they are not known: `1 - 1 / cost` of the layer, or else the probability of rock."""
-    layer = columns.layers.get(COST_LAYER)
-    return np.asarray(columns.top.probability)[target] if layer is None else 1 - 1 / np.maximum(layer, 1)
+    layer = part.layers.get(COST_LAYER)
+    return np.asarray(part.top.probability)[target] if layer is None else 1 - 1 / np.maximum(layer, 1)
 
 
 def _scaled(cost: Float[np.ndarray, "N"]) -> UInt8[np.ndarray, "N 2"]:

@@ -107,7 +107,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A map to be written in another form. Exporters go through `voxels` or `columns` and never hold it whole.
+    """A map to be written in another form. Exporters go through `voxels` or `parts` and never hold it whole.
 
     Attributes:
         reader: the map.
@@ -192,7 +192,7 @@ class Source:
                 centres, label, probability = (leaf[order] for leaf in voxels[1:4])
                 yield OccupiedVoxels(index[order], centres, label, probability, voxels.voxel_size_m)
 
-    def columns(self, margin: int = 0) -> Iterator[TopDownPart]:
+    def parts(self, margin: int = 0) -> Iterator[TopDownPart]:
         """The top-down map, block by block, with as many columns around each as there are."""
         params, rule = self.fusion
         reach = kernel_margin(params.class_kernel)
@@ -220,7 +220,7 @@ class Source:
             JaxmapError: it has more cells.
         """
         low, high = np.full(2, 2**62), np.zeros(2, np.int64)
-        for corner, top, *_ in self.columns():
+        for corner, top, *_ in self.parts():
             if len(cells := np.argwhere(top.observed)):
                 low, high = np.minimum(low, cells.min(0) + corner), np.maximum(high, cells.max(0) + 1 + corner)
         if (high <= low).any():
@@ -242,13 +242,13 @@ class Source:
         corner, (width, depth) = box
         whole: Any = unknown_top(len(self.classes), (width, depth))
         layers = {name: np.full((width, depth), np.nan, np.float32) for name in self.reader.attributes.layers}
-        for columns in self.columns():
-            x, y = np.argwhere(columns.top.observed).T
-            to = columns.moved(x, y, corner)
-            whole.probability[:, *to] = columns.top.probability[:, x, y]
-            for into, values in zip(whole[1:], columns.top[1:], strict=True):
+        for part in self.parts():
+            x, y = np.argwhere(part.top.observed).T
+            to = part.moved(x, y, corner)
+            whole.probability[:, *to] = part.top.probability[:, x, y]
+            for into, values in zip(whole[1:], part.top[1:], strict=True):
                 into[to] = values[x, y]
-            for name, values in columns.layers.items():
+            for name, values in part.layers.items():
                 layers[name][to] = values[x, y]
         return TopDownPart(corner, whole, layers, (slice(0, width), slice(0, depth)))
 

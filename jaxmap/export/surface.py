@@ -37,21 +37,21 @@ def patches(source: Source) -> Iterator[Patch]:
 
     Corners on the edge of two blocks are in both.
     """
-    for columns in source.columns(margin=_REACH + 1):
-        patch = _patch(source, columns)
+    for part in source.parts(margin=_REACH + 1):
+        patch = _patch(source, part)
         if len(patch.triangles):
             yield patch
 
 
-def _patch(source: Source, columns: TopDownPart) -> Patch:
-    observed = np.asarray(columns.top.observed)
-    height_m = columns.height_m if SURFACE in columns.layers else _smooth(columns.height_m, observed, source.size_m[2])
+def _patch(source: Source, part: TopDownPart) -> Patch:
+    observed = np.asarray(part.top.observed)
+    height_m = part.height_m if SURFACE in part.layers else _smooth(part.height_m, observed, source.size_m[2])
     number = np.arange(observed.size).reshape(observed.shape)
     quads = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
     known = observed.ravel()[quads]
     # A quad is of the block that has its first known corner; that block is stored, whatever else is.
     own = np.zeros(observed.shape, bool)
-    own[columns.own] = True
+    own[part.own] = True
     first_known = quads[np.arange(len(quads)), known.argmax(axis=1)]
     mine = own.ravel()[first_known] & (known.sum(axis=1) >= 3)
     quads, known = quads[mine], known[mine]
@@ -67,9 +67,9 @@ def _patch(source: Source, columns: TopDownPart) -> Patch:
     triangles = np.concatenate([*(six.reshape(-1, 3) for six in split), three])
     used, compact = np.unique(triangles, return_inverse=True)
     x, y = np.unravel_index(used, observed.shape)
-    place = np.stack([x, y], axis=-1) + np.asarray(columns.corner) + 0.5
+    place = np.stack([x, y], axis=-1) + np.asarray(part.corner) + 0.5
     points = np.column_stack([source.corner_m[:2] + place * source.size_m[:2], height_m[x, y]])
-    label = np.asarray(columns.top.label)[x, y]
+    label = np.asarray(part.top.label)[x, y]
     return Patch(points, source.colours_of(points, label), compact.reshape(-1, 3).astype(np.int64))
 
 

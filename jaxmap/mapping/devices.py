@@ -30,7 +30,7 @@ from jaxmap.mapping.step import (
     compile_step,
     report_of,
     see_frame,
-    with_step,
+    step_functions,
 )
 from jaxmap.types import Frame, VoxelMap, to_device
 
@@ -108,7 +108,7 @@ def on_devices(mapper: Mapper, devices: Sequence[Device]) -> Mapper:
         # What is gathered is the same everywhere, but its type does not say so.
         check_vma=False,
     )
-    return with_step(mapper, sharded)
+    return mapper._replace(**step_functions(sharded))
 
 
 def run_on_devices(

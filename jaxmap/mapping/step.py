@@ -123,12 +123,12 @@ def fuse_frame(
 ) -> tuple[VoxelMap, StepReport]:
     """The step itself: one frame into the map. `key` is the run's."""
     frame_key = jax.random.fold_in(key, voxel_map.frames_fused)
-    seen, rule = see_frame(design, voxel_map.grid, frame, params, frame_key), design.rule
-    fused, counted = add_sighting(voxel_map, seen.sighting, seen.window, params.fusion, rule, design.depth_range_m)
+    rule, depth_range_m = design.rule, design.depth_range_m
+    seen = see_frame(design, voxel_map.grid, frame, params, frame_key)
+    fused, counted = add_sighting(voxel_map, seen.sighting, seen.window, params.fusion, rule, depth_range_m)
     if design.members:
         assert params.ensemble is not None
-        depth_range_m, shape = design.depth_range_m, design.window_shape
-        camera, labels = seen.sighting.camera, seen.sighting.labels
+        camera, labels, shape = seen.sighting.camera, seen.sighting.labels, design.window_shape
         own = fuse_members(
             voxel_map, seen.frame, labels, camera, params.ensemble, frame_key, rule, depth_range_m, shape
         )
@@ -345,32 +345,29 @@ def make_mapper(
         check_inputs(design, frame, params)
         return label_image(design, frame, params, key, number)
 
-    mapper = Mapper(
+    return Mapper(
         design=design,
         init=lambda: make_voxel_map(grid, labeller.classes, members, surface=rule.surface),
-        step=fuse,
         fuse=fuse,
         scan=jax.jit(scan),
         label_image=jax.jit(label),
-        lower=lambda *inputs: jax.jit(fuse).lower(*inputs),
-        compilations=lambda: 0,
+        **step_functions(fuse),
     )
-    return with_step(mapper, fuse)
 
 
-def with_step(mapper: Mapper, fuse: Callable[..., Any]) -> Mapper:
-    """The mapper with another function, which is compiled, as its step; the map is its first argument and donated."""
+def step_functions(fuse: Callable[..., Any]) -> dict[str, Any]:
+    """The `step`, `lower` and `compilations` of a mapper, of a function whose first argument, the map, is donated."""
 
     def fuse_donated(tensors: _Tensors, rest: VoxelMap, *inputs: Any) -> Any:
         return fuse(replace(rest, **tensors._asdict()), *inputs)
 
     # Only the tensors are donated: the small arrays of the grid may be shared with other maps.
     compiled: Any = jax.jit(fuse_donated, donate_argnums=0)
-    return mapper._replace(
-        step=lambda voxel_map, *inputs: compiled(*_apart(voxel_map), *inputs),
-        lower=lambda voxel_map, *inputs: compiled.lower(*_apart(voxel_map), *inputs),
-        compilations=compiled._cache_size,
-    )
+    return {
+        "step": lambda voxel_map, *inputs: compiled(*_apart(voxel_map), *inputs),
+        "lower": lambda voxel_map, *inputs: compiled.lower(*_apart(voxel_map), *inputs),
+        "compilations": compiled._cache_size,
+    }
 
 
 class StepCost(NamedTuple):

@@ -51,8 +51,8 @@ def overview(source: Source, most_cells: int = MOST_CELLS) -> tuple[TopDown, dic
     top: Any = unknown_top(0, (width, depth))
     names = _ensemble_names(source)
     layers = {name: np.full((width, depth), np.nan, np.float32) for name in names}
-    for columns in source.columns():
-        _add(columns, step, source.target, top, layers)
+    for part in source.parts():
+        _add(part, step, source.target, top, layers)
     size_m = np.asarray(grid.voxel_size_m) * np.array([step, step, 1], np.float32)
     coarse = GridSpec(
         lattice_m=to_device(np.asarray(grid.origin_m), np.float32),
@@ -68,18 +68,18 @@ def _ensemble_names(source: Source) -> list[str]:
     return [name for name in names if name in source.reader.attributes.layers]
 
 
-def _add(columns: TopDownPart, step: int, target: int | None, top: Any, layers: dict[str, np.ndarray]) -> None:
+def _add(part: TopDownPart, step: int, target: int | None, top: Any, layers: dict[str, np.ndarray]) -> None:
     """Adds the columns of a block to the cells that they fall into."""
-    x, y = np.argwhere(columns.top.observed).T
-    height_m, label = np.asarray(columns.top.height_m)[x, y], np.asarray(columns.top.label)[x, y]
+    x, y = np.argwhere(part.top.observed).T
+    height_m, label = np.asarray(part.top.height_m)[x, y], np.asarray(part.top.label)[x, y]
     # The last of each cell stays: one of the target, or else the highest. Two blocks may share a cell.
     order = np.lexsort((height_m, label == target))
     x, y, height_m, label = (values[order] for values in (x, y, height_m, label))
-    to = ((x + columns.corner[0]) // step, (y + columns.corner[1]) // step)
+    to = ((x + part.corner[0]) // step, (y + part.corner[1]) // step)
     there_m, there = np.nan_to_num(top.height_m[to], nan=-np.inf), top.label[to] == target
     kept = np.where(there == (label == target), height_m >= there_m, label == target)
     at = tuple(side[kept] for side in to)
     top.label[at], top.height_m[at] = label[kept], height_m[kept]
     top.observed[to] = True
     for name, values in layers.items():
-        np.fmax.at(values, to, columns.layers[name][x, y])
+        np.fmax.at(values, to, part.layers[name][x, y])

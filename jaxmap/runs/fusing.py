@@ -50,8 +50,10 @@ from jaxmap.runs.folder import RunFolder
 from jaxmap.runs.hazard_layers import add_hazards
 from jaxmap.runs.labelling import Notify
 from jaxmap.runs.log import FrameNumbers, RunLog, numbers_of
-from jaxmap.runs.mapping import Pictures, map_attributes, notes, write_outputs
+from jaxmap.runs.map_in_progress import map_attributes
+from jaxmap.runs.mapping import Pictures, write_outputs
 from jaxmap.runs.mapping_plan import Plan, Sharing, plan_run
+from jaxmap.runs.metrics import notes
 from jaxmap.runs.perceiving import run_perception
 from jaxmap.runs.perceiving_shared import check_shareable, keep_on_workers
 from jaxmap.types import to_device
@@ -192,19 +194,8 @@ def map_on_workers(
 ) -> dict[str, Any]:
     """Maps a sequence on workers: they perceive its frames, then they fuse what was perceived.
 
-    Args:
-        source: the sequence.
-        config: the settings.
-        folder: the run folder.
-        workers: where the tasks run.
-        notify: takes lines for the user.
-        steps: shows progress.
-        resume: go on with a run that was interrupted.
-        overwrite: replace the run that is there.
-        keep: keep the observations.
-
-    Returns:
-        The metrics, as they are in metrics.json.
+    The arguments and what is returned are those of `map_observations`, but that `source` is a sequence; with `keep`,
+    the observations stay in the folder.
 
     Raises:
         JaxmapError: as `map_observations`, and as `run_perception`.

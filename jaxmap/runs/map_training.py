@@ -13,14 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxmap.datasets.crs import Extent, read_crs
+from jaxmap.datasets.crs import read_crs
 from jaxmap.datasets.label_raster import LabelRaster, choose_coding, read_label_orthomosaic
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.evaluation.cells import CellGrid
-from jaxmap.evaluation.evaluate import evaluate_map
+from jaxmap.evaluation.evaluate import evaluate_map, place_of
 from jaxmap.evaluation.options import ScoringOptions
 from jaxmap.geometry.cloud import project
-from jaxmap.geometry.grid import exact_corner
 from jaxmap.host.files import bundled
 from jaxmap.host.prefetch import prefetch
 from jaxmap.labels import IGNORE
@@ -191,8 +190,7 @@ class MapValidator:
             JaxmapError: the map is not finite.
         """
         data, plan = self._data, self._data.plan
-        labelling = plan.params.labeller
-        labelling = labelling._replace(weights=self._fold(weights))
+        labelling = plan.params.labeller._replace(weights=self._fold(weights))
         params = MapperParams(plan.params.camera, plan.params.fusion, labelling)
         voxel_map, examples = plan.mapper.init(), []
         for number, kept in enumerate(data.validation):
@@ -364,7 +362,8 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
         )
     if options.crs is not None:
         read_crs(options.crs, "map_truth.crs")
-    place, rasters, truths, labels, cells = _place(plan), {}, {}, None, None
+    place = place_of(plan.grid, plan.sequence.site_origin, plan.sequence.crs)
+    rasters, truths, labels, cells = {}, {}, None, None
     for index in shown:
         with _naming_options_of("evaluate", "map_truth"):
             raster = read_label_orthomosaic(path, place, coding=coding, target=config.classes[index], crs=options.crs)
@@ -376,14 +375,6 @@ def read_cells(plan: Plan, config: TrainConfig) -> tuple[CellTruth, dict[int, Ma
         labels[found.truly()] = index
     assert labels is not None and cells is not None
     return CellTruth(rasters, cells, labels), truths
-
-
-def _place(plan: Plan) -> Extent:
-    """The extent of the map in its coordinate reference system."""
-    origin_m, voxel_m = exact_corner(plan.grid)
-    low = plan.sequence.site_origin[:2] + origin_m[:2]
-    high = low + voxel_m[:2] * plan.grid.shape[:2]
-    return Extent(float(low[0]), float(low[1]), float(high[0]), float(high[1]), plan.sequence.crs)
 
 
 def prepare_training_frames(

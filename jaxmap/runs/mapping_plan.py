@@ -91,10 +91,10 @@ def describe_grid(
     depth_range_m: tuple[float, float],
     class_count: int,
     members: int,
-    block: tuple[int, int, int] | None = None,
-    held: str = "around the rover in memory",
+    block: tuple[int, int, int] | None,
+    held: str,
 ) -> str:
-    """One line on what is mapped, and the memory it takes."""
+    """One line on what is mapped, and the memory it takes: a map in tiles, that of the block that is `held`."""
     taken = f"{map_bytes(grid if block is None else replace(grid, shape=block), class_count, members) / 2**20:.0f} MiB"
     if block is not None:
         taken = f"in tiles on disk, {' x '.join(map(str, block))} voxels {held}, {taken}"
@@ -242,11 +242,9 @@ def plan_run(
         in_blocks = channels if in_tiles and not members else None
         limit_gib = config.grid.max_memory_gib
         grid, block = _fit_memory(grid, window, len(labeller.classes), members, limit_gib, in_blocks)
-    held = ("fused at a time",) if shared else ()
-    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block, *held))
-    match = None
-    if match_in_step and keeper is None and seen.observations is None and sequence.true_disparity is None:
-        match = front_end.matcher if isinstance(front_end.matcher, JaxMatcher) else None
+    held = "fused at a time" if shared else "around the rover in memory"
+    notify(describe_grid(grid, depth_range_m, len(labeller.classes), members, block, held))
+    match = _matcher_of_step(seen) if match_in_step and keeper is None else None
     key = jax.random.key(config.seed)
     ensemble, pose_errors = None, None
     if members:
@@ -276,6 +274,12 @@ def plan_run(
         block_shape=block,
         rover=_rover_of(config.rover, grid, notify),
     )
+
+
+def _matcher_of_step(seen: Perception) -> JaxMatcher | None:
+    """The matcher, where the step itself can match: nothing else wants the disparity of every frame."""
+    wanted = seen.observations is not None or seen.sequence.true_disparity is not None
+    return seen.front_end.matcher if isinstance(seen.front_end.matcher, JaxMatcher) and not wanted else None
 
 
 def _fit_memory(

@@ -27,6 +27,7 @@ from jaxmap.report.run_page import write_report
 from jaxmap.runs.exports import write_exports
 from jaxmap.runs.folder import RunFolder, count_voxels, write_poses
 from jaxmap.runs.hazard_layers import add_hazards
+from jaxmap.runs.metrics import grid_metrics
 from jaxmap.runs.run_frames import FrameRow, read_frame_table, write_frame_table
 
 _PICTURE = re.compile(r"(?P<frame>\d{6})_(?P<kind>left|disparity|labels)\.(?P<ending>png|webp)")
@@ -237,7 +238,6 @@ def _metrics(
     if not camera:
         notes.append("the cameras of the runs differ, or are not known: what they saw is not told apart in scores")
     ranges = [found for session in sessions if (found := _range_m(session)) is not None]
-    grid = reader.grid
     return {
         "jaxmap_version": jaxmap.__version__,
         "sequence": {
@@ -265,9 +265,7 @@ def _metrics(
         },
         **({"camera": camera | {"key_frames": key_frames}} if camera else {}),
         "grid": {
-            "shape": list(grid.shape),
-            "voxel_size_m": np.asarray(grid.voxel_size_m, np.float64).round(6).tolist(),
-            "origin_m": np.asarray(grid.origin_m, np.float64).round(6).tolist(),
+            **grid_metrics(reader.grid),
             **({"depth_range_m": [min(a for a, _ in ranges), max(b for _, b in ranges)]} if ranges else {}),
         },
         "labeller": _common(session.metrics.get("labeller") for session in sessions),

@@ -24,7 +24,7 @@ _FAR_BELOW = -1e4
 """Log-odds that lose every comparison, and are finite all the same: gradients of infinities are not."""
 
 
-class Columns(NamedTuple):
+class ColumnReductions(NamedTuple):
     """How the voxels of a list make columns: reductions from one number a voxel to an image of columns (X, Y)."""
 
     total: Callable[[Float[Array, "*v"]], Float[Array, "X Y"]]
@@ -43,12 +43,12 @@ class SoftColumns(NamedTuple):
     called: Float[Array, "X Y"]
 
 
-def columns_of_grid() -> Columns:
+def columns_of_grid() -> ColumnReductions:
     """The columns of a dense tensor (X, Y, Z)."""
-    return Columns(lambda values: values.sum(axis=-1), lambda values: values.max(axis=-1))
+    return ColumnReductions(lambda values: values.sum(axis=-1), lambda values: values.max(axis=-1))
 
 
-def columns_of_list(column: Int[Array, "V"], shape: tuple[int, int]) -> Columns:
+def columns_of_list(column: Int[Array, "V"], shape: tuple[int, int]) -> ColumnReductions:
     """The columns of a list of voxels.
 
     Args:
@@ -60,13 +60,15 @@ def columns_of_list(column: Int[Array, "V"], shape: tuple[int, int]) -> Columns:
     def greatest(values: Array) -> Array:
         return jnp.full(count, _FAR_BELOW, values.dtype).at[column].max(values).reshape(shape)
 
-    return Columns(lambda values: jnp.zeros(count, values.dtype).at[column].add(values).reshape(shape), greatest)
+    return ColumnReductions(
+        lambda values: jnp.zeros(count, values.dtype).at[column].add(values).reshape(shape), greatest
+    )
 
 
 def soft_columns(
     log_odds: Float[Array, "K *v"],
     observed: Bool[Array, "*v"] | Float[Array, "*v"],
-    columns: Columns,
+    columns: ColumnReductions,
     params: FusionParams,
     rule: FusionRule,
     classes: tuple[str, ...],

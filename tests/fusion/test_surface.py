@@ -35,13 +35,13 @@ def drawn(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndar
     return points, rng.uniform(0.005, 0.1, count).astype(np.float32), rng.random(count) < 0.8
 
 
-def close(one, other) -> None:
+def assert_close(one, other) -> None:
     np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-4)
 
 
 def test_statistics_equal_the_twin():
     points, sigma_m, keep = drawn(0)
-    close(
+    assert_close(
         over_layers(gather(GRID, points, sigma_m, keep)),
         reference_hazards.heights(points, sigma_m, keep, LOWER, CELL_M, SHAPE),
     )
@@ -52,8 +52,8 @@ def test_statistics_of_parts_are_those_of_all_in_any_order():
     part = np.arange(len(points)) % 3
     parts = [gather(GRID, points, sigma_m, keep & (part == number)) for number in range(3)]
     whole = gather(GRID, points, sigma_m, keep)
-    close(combine(combine(parts[0], parts[1]), parts[2]), whole)
-    close(combine(parts[2], combine(parts[1], parts[0])), whole)
+    assert_close(combine(combine(parts[0], parts[1]), parts[2]), whole)
+    assert_close(combine(parts[2], combine(parts[1], parts[0])), whole)
     np.testing.assert_array_equal(combine(whole, jnp.zeros_like(whole)), whole)
     np.testing.assert_array_equal(combine(jnp.zeros_like(whole), whole), whole)
     np.testing.assert_array_equal(combine(np.asarray(parts[0]), np.asarray(parts[1])), combine(parts[0], parts[1]))
@@ -68,7 +68,7 @@ def test_points_that_are_no_points_leave_nothing():
         np.concatenate([sigma_m, [0.1, 0.1, 0.1, np.nan]]).astype(np.float32),
         np.concatenate([keep, np.ones(4, bool)]),
     )
-    close(more, gather(GRID, points, sigma_m, keep))
+    assert_close(more, gather(GRID, points, sigma_m, keep))
 
 
 @pytest.mark.parametrize("height", [10, 40, 64])
@@ -86,7 +86,7 @@ def test_a_window_holds_what_the_whole_grid_does(height, first):
         level = np.floor(lattice - np.asarray(window.first))
         inside = ((level >= 0) & (level < window.shape)).all(axis=1)
         after = add_heights(before, within(tall, window, points, sigma_m, all_of_them), window)
-        close(after, combine(so_far, gather(tall, points, sigma_m, inside)))
+        assert_close(after, combine(so_far, gather(tall, points, sigma_m, inside)))
 
 
 def flat_map(height_m: float, count: int, noise_m: float = 0.01) -> VoxelMap:

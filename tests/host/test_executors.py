@@ -136,13 +136,13 @@ def test_workers_end_with_the_process_that_gave_the_tasks(tmp_path):
     parent = subprocess.Popen(
         [sys.executable, script, *names], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     )
-    wait_until(lambda: all(name.exists() and name.read_text() for name in names))
+    assert_soon(lambda: all(name.exists() and name.read_text() for name in names))
     parent.kill()
     parent.wait()
-    wait_until(lambda: not any(Path(f"/proc/{name.read_text()}").exists() for name in names))
+    assert_soon(lambda: not any(Path(f"/proc/{name.read_text()}").exists() for name in names))
 
 
-def wait_until(happened, within_s: float = 30.0) -> None:
+def assert_soon(happened, within_s: float = 30.0) -> None:
     until_s = time.monotonic() + within_s
     while not happened():
         assert time.monotonic() < until_s

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import jax
@@ -21,6 +23,9 @@ from jaxmap.matching.select import drop_edges, select
 HEIGHT, WIDTH, COUNT = 9, 24, 8
 PLAIN = MatchDesign(num_disparities=COUNT, speckle_window_px=0, edge_step_px=0.0)
 """No blob and no edge is dropped, which small images consist of."""
+
+CHECKS = [(0.0, -1), (0.125, -1), (0.0, 1), (0.0625, 2)]
+"""Uniqueness, and the greatest difference between left and right."""
 
 run = jax.jit(match, static_argnums=0)
 costs_of = jax.jit(cost_volume, static_argnums=0)
@@ -43,11 +48,18 @@ def volume(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 64, (HEIGHT, WIDTH, COUNT)).astype(np.uint8)
 
 
+def all_of(*ranges: Sequence, quick: Sequence[tuple]) -> list:
+    """All combinations, each a program of its own, of which some are enough for the quick suite."""
+    return [one if one in quick else pytest.param(*one, marks=pytest.mark.slow) for one in itertools.product(*ranges)]
+
+
 # --- against the twin
 
 
-@pytest.mark.parametrize("first", [0, 3, -4])
-@pytest.mark.parametrize("window_px", [(7, 9), (5, 5)])
+@pytest.mark.parametrize(
+    ("window_px", "first"),
+    all_of([(7, 9), (5, 5)], [0, 3, -4], quick=[((7, 9), 3), ((5, 5), -4)]),
+)
 def test_census_costs_are_those_of_the_twin(first, window_px):
     design = replace(PLAIN, min_disparity_px=first, census_window_px=window_px)
     bits = window_px[0] * window_px[1] - 1
@@ -57,8 +69,7 @@ def test_census_costs_are_those_of_the_twin(first, window_px):
     np.testing.assert_array_equal(np.asarray(cost, int) * bits, expected * design.cost_steps)
 
 
-@pytest.mark.parametrize("first", [0, -4])
-@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize(("first", "soft"), all_of([0, -4], [False, True], quick=[(-4, False), (0, True)]))
 def test_birchfield_tomasi_costs_are_those_of_the_twin(first, soft):
     design = replace(PLAIN, cost="bt", min_disparity_px=first, soft=soft)
     cap = design.pre_filter_cap
@@ -96,9 +107,12 @@ def test_sums_of_floats_are_those_of_the_twin():
     np.testing.assert_allclose(summed(costs, 0.1, 0.5, 8), twin.aggregate(costs, 0.1, 0.5, 8), rtol=1e-5)
 
 
-@pytest.mark.parametrize("first", [0, 2, -3])
-@pytest.mark.parametrize(("uniqueness", "left_right"), [(0.0, -1), (0.125, -1), (0.0, 1), (0.0625, 2)])
-def test_what_is_selected_is_what_the_twin_selects(first, uniqueness, left_right):
+@pytest.mark.parametrize(
+    ("first", "checks"),
+    all_of([0, 2, -3], CHECKS, quick=[(0, CHECKS[0]), (2, CHECKS[1]), (-3, CHECKS[2]), (2, CHECKS[3])]),
+)
+def test_what_is_selected_is_what_the_twin_selects(first, checks):
+    uniqueness, left_right = checks
     total = np.random.default_rng(first + 5).integers(0, 400, (HEIGHT, WIDTH, COUNT)).astype(np.uint16)
     design = replace(PLAIN, min_disparity_px=first, left_right_max_diff_px=left_right)
     params = make_match_params(uniqueness=uniqueness)

@@ -227,7 +227,7 @@ def with_header(path: Path, text: bytes, body: bytes = b"") -> Path:
     ],
 )
 def test_a_strange_safetensors_header_is_refused(text, tmp_path):
-    refusal(with_header(tmp_path / "a.safetensors", text, bytes(4)))
+    assert refusal(with_header(tmp_path / "a.safetensors", text, bytes(4)))
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from jaxmap.models.architecture import (
 from jaxmap.models.importers import VOC_CLASSES, convert, import_weights
 from jaxmap.models.network import weight_shapes
 
-DEEPEST = pytest.param("resnet101", marks=pytest.mark.slow)
+DEEP, DEEPEST = (pytest.param(name, marks=pytest.mark.slow) for name in ("resnet50", "resnet101"))
 
 
 def same(ours: dict[str, np.ndarray], architecture: Architecture, holds: str) -> bool:
@@ -30,7 +30,7 @@ def same(ours: dict[str, np.ndarray], architecture: Architecture, holds: str) ->
     return set(ours) == set(names) and all(np.array_equal(ours[name], expected[name]) for name in names)
 
 
-@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet18", "resnet50", DEEPEST])
+@pytest.mark.parametrize("backbone", ["mobilenet_v2", "resnet18", DEEP, DEEPEST])
 def test_torchvision_backbones(backbone, tmp_path):
     architecture = torch_architecture(backbone, ("background", "sand", "rock"))
     source = exported(architecture, list(tables.torchvision_backbone(backbone)), tables.TORCH)

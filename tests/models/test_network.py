@@ -173,7 +173,9 @@ def test_tensorflow_sizes_are_a_multiple_and_one():
     [
         lambda: InvertedResidual(4, 4, 2, 1, 2, SMALL),
         pytest.param(lambda: InvertedResidual(4, 6, 2, 2, 1, replace(SMALL, padding="same"), 5), marks=slow),
-        lambda: ResidualUnit(4, 2, 2, (1, 2), replace(SMALL, padding="same"), bottleneck=True),
+        pytest.param(
+            lambda: ResidualUnit(4, 2, 2, (1, 2), replace(SMALL, padding="same"), bottleneck=True), marks=slow
+        ),
         pytest.param(lambda: XceptionUnit(4, (4, 4, 6), 2, 1, SMALL, shortcut="conv"), marks=slow),
         lambda: Aspp(4, replace(SMALL, atrous_rates=(2,), head_channels=4)),
     ],
@@ -184,7 +186,8 @@ def test_gradients_equal_finite_differences(make):
     check_gradient(make, lambda model: model(jnp.asarray(images)))
 
 
-@pytest.mark.parametrize("record", [pytest.param(SMALL, marks=slow), folded(SMALL)], ids=["batch norm", "folded"])
+@slow
+@pytest.mark.parametrize("record", [SMALL, folded(SMALL)], ids=["batch norm", "folded"])
 def test_gradients_of_the_decoder_equal_finite_differences(record):
     draw = np.random.default_rng(0)
     coarse, fine = draw.normal(size=(1, 2, 3, 8)), draw.normal(size=(1, 7, 9, 4))

@@ -105,7 +105,7 @@ def test_a_bomb_is_refused_by_name_and_does_not_go_off(tmp_path, protocol):
     content = {"state_dict": {"w": Bomb(tmp_path / "gone_off")}}
     assert "refused" in refusal(write_zip(tmp_path / "bomb.pth", pickle.dumps(content, protocol=protocol)))
     assert "refused" in refusal(write(tmp_path / "old.pth", legacy_bytes({}, content=content)))
-    refusal(write(tmp_path / "alone.pth", pickle.dumps(content, protocol=protocol)))
+    assert refusal(write(tmp_path / "alone.pth", pickle.dumps(content, protocol=protocol)))
     assert not (tmp_path / "gone_off").exists()
 
 
@@ -137,7 +137,7 @@ def test_other_names_and_instructions_are_refused(tmp_path, program):
     ],
 )
 def test_shapes_that_the_file_does_not_hold_are_refused(tmp_path, program, size):
-    refusal(write_zip(tmp_path / "a.pth", program, s0=bytes(size)))
+    assert refusal(write_zip(tmp_path / "a.pth", program, s0=bytes(size)))
 
 
 def test_compressed_members_are_refused(tmp_path):
@@ -184,7 +184,7 @@ def test_a_wrong_part_of_the_old_format_is_refused(changes, reason, tmp_path):
 
 def test_storages_of_the_old_format_end_with_the_file(tmp_path):
     whole = legacy_bytes(TWO)
-    refusal(write(tmp_path / "a.pth", whole + b"0"))
+    assert refusal(write(tmp_path / "a.pth", whole + b"0"))
     lying = whole.replace(b"K\x06", b"M\xff\xff").replace((6).to_bytes(8, "little"), (0xFFFF).to_bytes(8, "little"))
     assert "storage 1000 should hold 262140 bytes" in refusal(write(tmp_path / "a.pth", lying))
     half = whole.replace(b"1001", b"1000")
@@ -196,4 +196,4 @@ def test_a_truncated_file_is_an_error(name, tmp_path):
     whole = (GOLDEN / name).read_bytes()
     for length in (0, 10, 15, 100, len(whole) // 2, len(whole) - 50, len(whole) - 1):
         (tmp_path / "cut.pth").write_bytes(whole[:length])
-        refusal(tmp_path / "cut.pth")
+        assert refusal(tmp_path / "cut.pth")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
+from compiling import compiled_in_full
 from fixtures import cli, scene_copy, scene_folder, shared_cache  # noqa: F401
 from html_tables import tables_of
 from killed import SLOW_DISK, fill_disk, kill_when
@@ -42,6 +43,8 @@ from jaxmap.runs.refinement import (
 )
 from jaxmap.stereo.rectify import make_rectifier, make_stereo_rig
 from jaxmap.types import make_grid, pinhole
+
+in_full = pytest.fixture(scope="module", autouse=True)(compiled_in_full)
 
 FRAMES = 4
 T_TRUE = np.stack([pose(index) for index in range(FRAMES)])

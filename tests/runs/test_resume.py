@@ -56,7 +56,20 @@ def run_until(
         )
 
 
-def same_run(run: Path, whole: Path) -> None:
+@pytest.fixture(scope="module")
+def run_cut_at_two(scene_folder, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("cut") / "run"
+    run_until(scene_folder, out, 2)
+    return out
+
+
+@pytest.fixture
+def cut_run(run_cut_at_two, tmp_path) -> Path:
+    """A run that was cut off when two frames were saved."""
+    return Path(shutil.copytree(run_cut_at_two, tmp_path / "run"))
+
+
+def assert_same_run(run: Path, whole: Path) -> None:
     np.testing.assert_array_equal(log_odds(run), log_odds(whole))
     assert (run / "poses.tum").read_bytes() == (whole / "poses.tum").read_bytes()
     assert (run / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
@@ -81,7 +94,7 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(index, cli, scene_folder, fini
     outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume"))
     assert outcome.status == 0
     assert index == 0 or f"going on after {index} of {FRAMES} frames" in outcome.err
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 @pytest.mark.slow
@@ -112,9 +125,8 @@ def test_an_interrupt_right_after_a_frame_loses_no_picture(cli, scene_folder, fi
 
 
 @pytest.mark.slow
-def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    folder = RunFolder(tmp_path / "run")
+def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, cut_run):
+    folder = RunFolder(cut_run)
     folder.begin(planned(scene_folder).settings(config_of()), resume=True, overwrite=False)
     with pytest.raises(Cut):
         run_plan(
@@ -125,8 +137,8 @@ def test_a_run_may_be_cut_twice(cli, scene_folder, finished_run, tmp_path):
             notify=lambda line: None,
             on_frame=cut_after(4),
         )
-    assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert cli(*map_words(scene_folder, cut_run, "--resume")).status == 0
+    assert_same_run(cut_run, finished_run)
 
 
 @pytest.mark.slow
@@ -143,14 +155,14 @@ def test_a_skipped_frame_is_counted_once_over_a_cut(cli, scene_copy, tmp_path):
 def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_path):
     # The frames are slowed down, so that the process dies in the middle of the run.
     program = (
-        "import sys, time, jaxmap.mapping.sequence, jaxmap.runs.mapping\n"
+        "import sys, time, jaxmap.mapping.devices\n"
         "from jaxmap.commands.main import main\n"
-        "fuse = jaxmap.mapping.sequence.run_sequence\n"
+        "fuse = jaxmap.mapping.devices.run_sequence\n"
         "def slowly(*words, **options):\n"
         "    for result in fuse(*words, **options):\n"
         "        yield result\n"
         "        time.sleep(0.5)\n"
-        "jaxmap.runs.mapping.run_sequence = slowly\n"
+        "jaxmap.mapping.devices.run_sequence = slowly\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
     run = tmp_path / "run"
@@ -159,7 +171,7 @@ def test_a_killed_process_is_gone_on_with(cli, scene_folder, finished_run, tmp_p
     assert 2 <= _saved_frames(run) < FRAMES
     assert not (run / "metrics.json").exists()
     assert cli(*map_words(scene_folder, run, "--resume")).status == 0
-    same_run(run, finished_run)
+    assert_same_run(run, finished_run)
     assert not [path for path in run.iterdir() if path.name.startswith(".")], "no leftovers"
 
 
@@ -170,32 +182,29 @@ def _saved_frames(run: Path) -> int:
         return 0
 
 
-def test_other_settings_are_refused_by_name(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    before = contents(tmp_path / "run")
+def test_other_settings_are_refused_by_name(cli, scene_folder, cut_run):
+    before = contents(cut_run)
     for words, name in (
         (("--fusion.class-hit", "1.1"), "fusion.class_hit"),
         (("--stride", "2"), "stride"),
         (("--plane.threshold-m", "0.2"), "plane.threshold_m"),
     ):
-        outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", *words))
+        outcome = cli(*map_words(scene_folder, cut_run, "--resume", *words))
         assert outcome.status == 2
         assert name in outcome.error
-    assert contents(tmp_path / "run") == before
+    assert contents(cut_run) == before
 
 
 @pytest.mark.slow
-def test_another_sequence_is_refused(cli, scene_folder, scene_copy, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    outcome = cli(*map_words(scene_copy, tmp_path / "run", "--resume"))
+def test_another_sequence_is_refused(cli, scene_copy, cut_run):
+    outcome = cli(*map_words(scene_copy, cut_run, "--resume"))
     assert outcome.status == 2
     assert "sequence" in outcome.error
 
 
 @pytest.mark.slow
-def test_how_often_to_save_is_no_setting_of_the_map(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--checkpoint-every-s", "5"))
+def test_how_often_to_save_is_no_setting_of_the_map(cli, scene_folder, cut_run):
+    outcome = cli(*map_words(scene_folder, cut_run, "--resume", "--checkpoint-every-s", "5"))
     assert outcome.status == 0
 
 
@@ -228,13 +237,12 @@ def test_a_sequence_that_grew_does_not_go_on_in_too_small_a_map(cli, scene_folde
         assert list(shape) == metrics_of(tmp_path / "run")["grid"]["shape"]
 
 
-def test_a_used_folder_is_left_alone(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    before = contents(tmp_path / "run")
-    outcome = cli(*map_words(scene_folder, tmp_path / "run"))
+def test_a_used_folder_is_left_alone(cli, scene_folder, cut_run):
+    before = contents(cut_run)
+    outcome = cli(*map_words(scene_folder, cut_run))
     assert outcome.status == 1
-    assert all(way in outcome.error for way in ("--resume", "--overwrite", str(tmp_path / "run")))
-    assert contents(tmp_path / "run") == before
+    assert all(way in outcome.error for way in ("--resume", "--overwrite", str(cut_run)))
+    assert contents(cut_run) == before
 
 
 @pytest.mark.slow
@@ -279,7 +287,7 @@ def test_an_overwriting_run_that_was_cut_off_is_gone_on_with(cli, scene_folder, 
     assert outcome.status == 1 and "holds a run already" in outcome.error
     outcome = cli(*map_words(scene_folder, earlier_run, "--resume"))
     assert outcome.status == 0 and "going on after 3" in outcome.err
-    same_run(earlier_run, finished_run)
+    assert_same_run(earlier_run, finished_run)
     assert not [path for path in earlier_run.iterdir() if path.name.startswith(".")]
 
 
@@ -290,19 +298,18 @@ def test_an_overwriting_run_that_is_killed_leaves_the_one_before_it(cli, scene_f
     kill_when((earlier_run / ".new" / "map.zarr").exists, SLOW_DISK, words)
     assert before.items() <= contents(earlier_run).items()
     assert cli(*map_words(scene_folder, earlier_run, "--resume")).status == 0
-    same_run(earlier_run, finished_run)
+    assert_same_run(earlier_run, finished_run)
 
 
 def test_a_run_that_was_whole_when_its_process_was_killed_is_put_in_place(cli, finished_run, earlier_run):
     shutil.copytree(finished_run, earlier_run / ".whole")
     assert cli("report", earlier_run).status == 0
-    same_run(earlier_run, finished_run)
+    assert_same_run(earlier_run, finished_run)
 
 
 @pytest.mark.slow
-def test_overwriting_and_resuming_exclude_each_other(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 2)
-    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume", "--overwrite"))
+def test_overwriting_and_resuming_exclude_each_other(cli, scene_folder, cut_run):
+    outcome = cli(*map_words(scene_folder, cut_run, "--resume", "--overwrite"))
     assert outcome.status == 2, "one of the two is not done"
 
 
@@ -314,25 +321,24 @@ def test_a_complete_run_is_gone_on_with_to_the_same_end(cli, scene_folder, finis
     outcome = cli(*map_words(scene_folder, run, "--resume"))
     assert outcome.status == 0
     assert "complete already" in outcome.err
-    same_run(run, finished_run)
+    assert_same_run(run, finished_run)
 
 
 @pytest.mark.slow
 def test_resuming_in_an_empty_folder_starts(cli, scene_folder, finished_run, tmp_path):
     (tmp_path / "run").mkdir()
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
-def test_a_damaged_checkpoint_is_an_error_and_is_kept(cli, scene_folder, tmp_path):
-    run_until(scene_folder, tmp_path / "run", 3)
-    chunk = max((tmp_path / "run" / "map.zarr").rglob("*"), key=lambda path: path.stat().st_size * path.is_file())
+def test_a_damaged_checkpoint_is_an_error_and_is_kept(cli, scene_folder, cut_run):
+    chunk = max((cut_run / "map.zarr").rglob("*"), key=lambda path: path.stat().st_size * path.is_file())
     chunk.write_bytes(chunk.read_bytes()[:-20] + bytes(20))
-    before = contents(tmp_path / "run")
-    outcome = cli(*map_words(scene_folder, tmp_path / "run", "--resume"))
+    before = contents(cut_run)
+    outcome = cli(*map_words(scene_folder, cut_run, "--resume"))
     assert outcome.status == 1
     assert "map.zarr" in outcome.error
-    assert contents(tmp_path / "run") == before
+    assert contents(cut_run) == before
 
 
 @pytest.mark.slow
@@ -354,7 +360,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(cli, scene_folder, finished_run,
     assert load_map(tmp_path / "run" / "map.zarr")[1].progress["next_index"] == 2
     assert not (tmp_path / "run" / "metrics.json").exists()
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 @pytest.mark.slow
@@ -369,7 +375,7 @@ def test_a_full_disk_at_the_end_leaves_a_map_to_resume(writer, cli, scene_folder
         patched.setattr(jaxmap.runs.mapping, writer, full)
         assert cli(*map_words(scene_folder, tmp_path / "run")).status == 1
     assert cli(*map_words(scene_folder, tmp_path / "run", "--resume")).status == 0
-    same_run(tmp_path / "run", finished_run)
+    assert_same_run(tmp_path / "run", finished_run)
 
 
 @pytest.mark.slow

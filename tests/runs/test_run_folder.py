@@ -131,7 +131,9 @@ def test_an_interrupt_saves_what_is_there(scene_folder, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run_plan(plan, folder, strict=True, checkpoint_every_s=60.0, notify=told.append, on_frame=interrupt)
     assert told[-1] == "interrupted and saved after 3 frames; --resume goes on there"
-    assert open_map(folder.map).attributes.progress["next_index"] == 3
+    progress = open_map(folder.map).attributes.progress
+    assert progress["next_index"] == 3
+    assert progress["total_s"] > 0, "the time that it took is not forgotten"
 
 
 def test_what_ends_a_job_is_told_like_ctrl_c(cli, scene_folder, tmp_path):

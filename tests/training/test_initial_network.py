@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from compiling import compiled_quickly
 from golden.seeded_weights import seeded_weights
-from tiny_training import compiled_quickly
 
 from jaxmap.errors import JaxmapError, UsageError
 from jaxmap.models.architecture import Architecture, tf_architecture, torch_architecture

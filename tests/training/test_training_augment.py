@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference_augment
+from compiling import compiled_quickly
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from tiny_training import compiled_quickly
 
 from jaxmap.labels import IGNORE
 from jaxmap.training.augment import (

@@ -8,9 +8,9 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from compiling import compiled_quickly
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_training import compiled_quickly
 from training_data import CLASSES, scene, write_pair
 
 from jaxmap.errors import JaxmapError

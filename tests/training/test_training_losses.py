@@ -10,9 +10,9 @@ import numpy as np
 import optax
 import pytest
 import reference_losses
+from compiling import compiled_quickly
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_training import compiled_quickly
 
 from jaxmap.errors import UsageError
 from jaxmap.labels import ANY_OTHER, IGNORE

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from compiling import compiled_quickly
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_training import compiled_quickly
 
 from jaxmap.training.options import OptimiserOptions
 from jaxmap.training.step import is_statistic, make_optimiser, poly_rate, trained_names

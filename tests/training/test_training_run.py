@@ -63,7 +63,7 @@ def saved_steps(run: Path) -> list[int]:
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal()) if folder.is_dir() else []
 
 
-def same_run(run: Path, whole: Path) -> None:
+def assert_same_run(run: Path, whole: Path) -> None:
     """Everything is bit-identical, apart from the times."""
     assert (run / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
     ours, expected = ([{k: v for k, v in row.items() if k not in TIMES} for row in history_of(f)] for f in (run, whole))
@@ -207,7 +207,7 @@ def test_a_cut_run_ends_as_if_it_had_not_been_cut(step, plan, whole_run, tmp_pat
     assert saved_steps(run) == {1: [], 4: [3], STEPS: [3, 5]}[step]
     lines = go(plan, run, resume=True)
     assert (f"resuming after epoch 1 of {EPOCHS}" in lines) == (step == 4)
-    same_run(run, whole_run)
+    assert_same_run(run, whole_run)
 
 
 @pytest.mark.slow
@@ -216,7 +216,7 @@ def test_a_run_may_be_cut_again_and_again(plan, whole_run, tmp_path):
     run_until(plan, tmp_path / "run", 6, resume=True)
     run_until(plan, tmp_path / "run", 8, resume=True)
     go(plan, tmp_path / "run", resume=True)
-    same_run(tmp_path / "run", whole_run)
+    assert_same_run(tmp_path / "run", whole_run)
 
 
 SLOWLY = """
@@ -241,7 +241,7 @@ def test_a_killed_process_is_resumed(plan, tiny_data, whole_run, tmp_path):
     kill_when(lambda: saved_steps(run), SLOWLY, train_words(tiny_data, run))
     assert saved_steps(run)[-1] < STEPS
     go(plan, run, resume=True)
-    same_run(run, whole_run)
+    assert_same_run(run, whole_run)
     assert {path.name for path in run.iterdir()} == OUTPUTS, "no leftovers"
     assert all(path.name.isdecimal() for path in (run / "checkpoints").iterdir())
 
@@ -273,7 +273,7 @@ def test_an_interrupt_is_one_line_and_says_how_to_resume(
     assert "Interrupted in epoch 2 of 3." in (run / "report.html").read_text()
     assert [row["epoch"] for row in history_of(run)] == ["1"]
     go(plan, run, resume=True)
-    same_run(run, whole_run)
+    assert_same_run(run, whole_run)
     assert "Interrupted" not in (run / "report.html").read_text()
 
 
@@ -287,7 +287,7 @@ def test_a_complete_run_has_nothing_left_to_do(cli, tiny_data, run_copy):
 def test_resuming_in_an_empty_folder_starts(plan, whole_run, tmp_path):
     (tmp_path / "run").mkdir()
     go(plan, tmp_path / "run", resume=True)
-    same_run(tmp_path / "run", whole_run)
+    assert_same_run(tmp_path / "run", whole_run)
 
 
 # --- refused
@@ -321,7 +321,7 @@ def test_a_run_is_replaced_only_where_that_is_asked_for(plan, whole_run, run_cop
     error = refused(plan, run_copy)
     assert "--resume" in error and "--overwrite" in error
     go(plan, run_copy, overwrite=True)
-    same_run(run_copy, whole_run)
+    assert_same_run(run_copy, whole_run)
     assert (run_copy / "mine.txt").read_text() == "not the run's"
 
 
@@ -361,7 +361,7 @@ def test_a_run_that_is_replaced_stays_until_the_new_one_is_whole(plan, whole_run
     assert refused(plan._replace(config=replace(plan.config, seed=1)), run_copy, UsageError, resume=True)
     lines = go(plan, run_copy, resume=True)
     assert lines[0].startswith("resuming after epoch")
-    same_run(run_copy, whole_run)
+    assert_same_run(run_copy, whole_run)
     assert not (run_copy / ".new").exists()
 
 
@@ -439,7 +439,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_its_images(plan, whol
     assert not metrics_of(run)["complete"]
     # What was kept is good: the run can resume from there.
     go(plan, run, resume=True)
-    same_run(run, whole_run)
+    assert_same_run(run, whole_run)
 
 
 @pytest.mark.slow
@@ -480,7 +480,7 @@ def halve(folder: Path) -> None:
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(plan, whole_run, run_copy):
     halve(run_copy / "checkpoints" / str(STEPS))
     assert f"resuming after epoch 2 of {EPOCHS}" in go(plan, run_copy, resume=True)
-    same_run(run_copy, whole_run)
+    assert_same_run(run_copy, whole_run)
     # The damaged one has been replaced.
     assert go(plan, run_copy, resume=True)[-1] == "the run is complete; nothing is left to do"
 
@@ -567,4 +567,4 @@ def test_a_full_disk_is_one_line_and_the_run_is_resumed_after_it(share, plan, wh
         assert not metrics_of(run)["complete"]
     small_disk.mount(20 * needed, MS_REMOUNT)
     go(plan, run, resume=True)
-    same_run(run, whole_run)
+    assert_same_run(run, whole_run)

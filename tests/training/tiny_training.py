@@ -12,8 +12,8 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import jax
 import pytest
+from compiling import optimised
 from flax import nnx
 from jaxtyping import Array
 from training_data import CLASSES, write_data
@@ -33,7 +33,6 @@ augmentation: {crop_px: [32, 32], scale: [0.75, 1.5]}
 optimiser: {learning_rate: 0.005, warmup_steps: 2}
 network: {head_channels: 8, low_level_channels: 4, atrous_rates: [], decoder: false}
 """
-FLAG = "jax_disable_most_optimizations"
 EPOCHS, STEPS = 3, 8
 """Of this configuration on the five training images: the batches of one epoch reach into the next."""
 
@@ -62,17 +61,6 @@ class TinyBackbone(nnx.Module):
 
 
 @contextmanager
-def unoptimised() -> Iterator[None]:
-    """Within it, programs are compiled with few optimisations, which takes less time."""
-    before = jax.config.read(FLAG)
-    jax.config.update(FLAG, True)
-    try:
-        yield
-    finally:
-        jax.config.update(FLAG, before)
-
-
-@contextmanager
 def tiny_network() -> Iterator[None]:
     """Within it, `mobilenet_v2` names the tiny backbone, and programs are compiled with few optimisations."""
     builders: dict = backbones.BUILDERS
@@ -80,7 +68,7 @@ def tiny_network() -> Iterator[None]:
     builders["mobilenet_v2"] = TinyBackbone
     network.weight_shapes.cache_clear()
     try:
-        with unoptimised():
+        with optimised(False):
             yield
     finally:
         builders["mobilenet_v2"] = before
@@ -91,12 +79,6 @@ def tiny_network() -> Iterator[None]:
 def network_is_tiny() -> Iterator[None]:
     """For all tests of the module that imports it."""
     with tiny_network():
-        yield
-
-
-def compiled_quickly() -> Iterator[None]:
-    """The fixture of modules with many programs that run once."""
-    with unoptimised():
         yield
 
 
