@@ -268,10 +268,12 @@ def test_the_coding_of_an_orthomosaic_can_be_given(inputs, tmp_path):
 
 
 def test_every_option_out_of_bounds_is_named(cli, tmp_path):
-    words = ("--sigma-position-m", -1, "--max-pose-gap-s", "nan", "--max-depth-m", "inf")
+    words = ("--sigma-position-m", -1, "--max-depth-m", "inf")
     outcome = cli("refine", "scene", "--out", tmp_path / "out", *words)
     assert outcome.status == 2
     assert all(f"{option} is" in outcome.error for option in words[::2])
+    outcome = cli("refine", "scene", "--out", tmp_path / "out", "--max-pose-gap-s", "nan")
+    assert outcome.status == 2 and "max_pose_gap_s is nan" in outcome.error
 
 
 def test_files_of_others_are_not_replaced(tmp_path):
