@@ -55,8 +55,7 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
   });
   if (frame.carve) {
     const View view(frame);
-    float* along = work->along.of(frame.shape[1]);
-    for (int64_t y = 0; y < frame.shape[1]; ++y) along[y] = frame.centre(1, y);
+    measure_row(frame, work->along);
     in_parallel(pool, frame.shape[0], [&](int64_t plane) { freed += carve_plane(frame, view, plane, *work); });
   }
   for (int64_t share = 0; share < threads; ++share) {

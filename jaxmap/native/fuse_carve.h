@@ -12,6 +12,7 @@
 
 #include "fuse_frame.h"
 #include "fuse_points.h"
+#include "vectors.h"
 
 namespace jaxmap {
 
@@ -110,6 +111,12 @@ inline int32_t mark_before(const float* distance, const float* reach, const int3
   return any;
 }
 
+// The y of the centres along a row; those beyond the window, up to where they are looked up together, are nowhere.
+inline void measure_row(const Frame& frame, Scratch<float>& along) {
+  float* y = along.of(frame.shape[1] + kTogether);
+  for (int64_t j = 0; j < frame.shape[1] + kTogether; ++j) y[j] = j < frame.shape[1] ? frame.centre(1, j) : NAN;
+}
+
 // Marks down the voxels of one plane of the window that the camera saw through; returns how many.
 inline int32_t carve_plane(const Frame& frame, const View& view, int64_t plane, const Workspace& work) {
   const float miss = frame.numbers.miss, x = frame.centre(0, plane);
@@ -122,7 +129,8 @@ inline int32_t carve_plane(const Frame& frame, const View& view, int64_t plane, 
     float* cells = frame.log_odds + frame.cell(plane, 0, level);
     const int32_t* slots = work.voxel_slots.data() + plane * frame.shape[1] * depth + level;
     for (int64_t begin = row.begin; begin < row.end; begin += kTogether) {
-      const int count = int(std::min<int64_t>(kTogether, row.end - begin));
+      // Whole vectors, beyond the row as well: there, too, it is looked up what is free.
+      const int count = int(std::min<int64_t>(kTogether, (row.end - begin + kLanes - 1) / kLanes * kLanes));
       look_up(frame, x, work.along.get() + begin, z, count, found);
       if (mark_before(found.distance, work.block_reach.get(), found.block, count, before) == 0 ||
           mark_before(found.distance, work.reach.get(), found.pixel, count, before) == 0)

@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <memory>
 #include <utility>
 
 #include "fuse_frame.h"
@@ -236,11 +237,22 @@ inline void add_runs(const Frame& frame, int64_t pixel, int count, const Strip& 
   }
 }
 
+// What a thread keeps from tile to tile.
+struct TileMemory {
+  Strip strip;
+  TileSums sums;
+  Scratch<float> values;
+
+  // To be asked for once a tile: a library looks up what is a thread's own by a call.
+  static TileMemory& own() {
+    thread_local const auto memory = std::make_unique<TileMemory>();
+    return *memory;
+  }
+};
+
 // Sums up the points of a tile by voxels; returns how many there are.
 inline PixelCounts sum_tile(const Frame& frame, int64_t tile, Workspace& work) {
-  thread_local TileSums sums;
-  thread_local Strip strip;
-  thread_local Scratch<float> kept;
+  auto& [strip, sums, kept] = TileMemory::own();
   float *values = kept.of((frame.value_rows() + 1) * kStride), farthest[kTileColumns] = {};
   PixelCounts counts;
   const int64_t tiles_across = (frame.width + kTileColumns - 1) / kTileColumns;

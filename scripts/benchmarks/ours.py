@@ -182,7 +182,9 @@ def fuse_frame(scene: Scene, size: str, add: Callable[..., Any] = add_sighting) 
     empty = make_voxel_map(grid, ROVER_CLASSES)
     shape = window_shape(grid, scene.camera, DEPTH_RANGE_M[1], moved_poses(scene, 1))
 
-    def fuse(log_odds: jax.Array, rest: VoxelMap, disparity_px: jax.Array, labels: PointLabels, pose: jaxlie.SE3) -> Any:
+    def fuse(
+        log_odds: jax.Array, rest: VoxelMap, disparity_px: jax.Array, labels: PointLabels, pose: jaxlie.SE3
+    ) -> Any:
         window = view_window(rest.grid, scene.camera, pose, DEPTH_RANGE_M[1], shape)
         sighting = Sighting(scene.camera, pose, disparity_px, labels)
         return add(replace(rest, log_odds=log_odds), sighting, window, params, RULE, DEPTH_RANGE_M)[0].log_odds
