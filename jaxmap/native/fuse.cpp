@@ -104,7 +104,8 @@ ffi::Error fuse_frame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi:
   frame.log_odds = new_log_odds->typed_data();
   frame.surface = surface.element_count() ? new_surface->typed_data() : nullptr;
   // Where XLA could not give the results the place of the arguments.
-  if (frame.log_odds != log_odds.typed_data()) std::memcpy(frame.log_odds, log_odds.typed_data(), log_odds.size_bytes());
+  if (frame.log_odds != log_odds.typed_data())
+    std::memcpy(frame.log_odds, log_odds.typed_data(), log_odds.size_bytes());
   if (frame.surface != nullptr && frame.surface != surface.typed_data())
     std::memcpy(frame.surface, surface.typed_data(), surface.size_bytes());
   fuse(pool, frame, counted->typed_data());

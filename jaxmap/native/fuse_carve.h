@@ -103,7 +103,8 @@ inline void look_up(const Frame& frame, float x, const float* y, float z, int co
 }
 
 // Marks the voxels that lie before what was seen where they are; returns how many do.
-inline int32_t mark_before(const float* distance, const float* reach, const int32_t* place, int count, int32_t* before) {
+inline int32_t mark_before(const float* distance, const float* reach, const int32_t* place, int count,
+                           int32_t* before) {
   float there[kTogether];
   for (int j = 0; j < count; ++j) there[j] = reach[place[j]];
   int32_t any = 0;

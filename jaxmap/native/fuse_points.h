@@ -1,8 +1,8 @@
 // From pixels to sums over the points in each voxel, a tile of pixels at a time. Points never lie in memory.
 //
-// Neighbours in a row that fall into one voxel are a run. Each run is added, lane by lane of the vectors, to the sums of
-// its voxel in the tile; the lanes are added up when the tile is done. What a voxel gets thus hangs neither on the
-// window nor on the number of threads.
+// Neighbours in a row that fall into one voxel are a run. Each run is added, lane by lane, to the sums of its voxel in
+// the tile; the lanes are added up when the tile is done. What a voxel gets thus hangs neither on the window nor on the
+// number of threads.
 
 #pragma once
 
@@ -40,7 +40,7 @@ struct Strip {
   uint8_t starts[kTileColumns + sizeof(uint64_t)];    // where a run starts
 };
 
-// Sums over points are kept in eight lanes, on all processors, and so have the same bits on all.
+// Sums over points are kept in eight lanes: points are added in one order on all processors.
 constexpr int kLaneCount = 8;
 typedef float Lanes __attribute__((vector_size(kLaneCount * sizeof(float))));
 typedef int32_t LaneMask __attribute__((vector_size(kLaneCount * sizeof(int32_t))));
@@ -169,7 +169,7 @@ inline void weigh_heights(const Frame& frame, const Strip& strip, int count, flo
   }
 }
 
-// Marks where runs start, and past the end, so that one is always found; where there are labels, points of a run share it.
+// Marks where runs start, and past the end, so that one is always found. Points of a run have one label, if any.
 inline void find_runs(const int32_t* __restrict voxels, const int32_t* __restrict labels, int count,
                       uint8_t* __restrict starts) {
   starts[0] = 1;
