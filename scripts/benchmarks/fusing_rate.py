@@ -80,7 +80,9 @@ def main() -> None:
             subprocess.run([sys.executable, "-m", "jaxmap", *words], check=True, stdout=subprocess.DEVNULL)
         runs = {}
         for title, (settings, _) in TARGETS.items():
-            runs[title] = Fusing(without_pictures(plan_run(str(observations), check_config(settings), lambda line: None)))
+            runs[title] = Fusing(
+                without_pictures(plan_run(str(observations), check_config(settings), lambda line: None))
+            )
         for run in runs.values():
             run.rate(4)
         rates: dict[str, list[tuple[float, float]]] = {title: [] for title in runs}
