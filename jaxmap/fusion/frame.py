@@ -119,7 +119,9 @@ def add_plainly(
     return add_evidence_of(voxel_map, evidence, window), evidence.counted
 
 
-def _count_voxels(hits: Bool[Array, "X Y Z"], free: Bool[Array, "X Y Z"] | None) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def _count_voxels(
+    hits: Bool[Array, "X Y Z"], free: Bool[Array, "X Y Z"] | None
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
     freed = jnp.zeros_like(hits) if free is None else free & ~hits
     # Both in one sum, the second above 16 bits, and first along the short axis: thrice as fast as two sums.
     both = (hits.astype(jnp.int32) + (freed.astype(jnp.int32) << 16)).sum(axis=2)

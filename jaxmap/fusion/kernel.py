@@ -130,9 +130,9 @@ def _numbers(
 ) -> Float[Array, "K"]:
     """`Numbers` of the kernel, and the matrix of increments."""
     camera, pose, size_m, prior = sighting.camera, sighting.T_world_camera, window.voxel_size_m, params.occupancy_prior
-    sigma = depth_sigma(camera, jnp.ones(()), params.disparity_sigma_px)
+    sigma, R_world_camera = depth_sigma(camera, jnp.ones(()), params.disparity_sigma_px), pose.rotation().as_matrix()
     parts = [
-        *(part for T in (pose, pose.inverse()) for part in (T.rotation().as_matrix(), T.translation())),
+        *(R_world_camera, pose.translation(), R_world_camera.T, pose.inverse().translation()),
         *(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.doffs_px, camera.baseline_m * camera.fx_px),
         *(sigma, 1.0 / size_m.mean() if rule.range_weighting else 0.0, POSE_SIGMA_M**2),
         *(0.5 * jnp.linalg.norm(size_m), MARGIN_SIGMAS * sigma, *depth_range_m, window.lattice_m, size_m),

@@ -456,7 +456,7 @@ def _read_array(where: Path, name: str, shape: Sequence[int]) -> np.ndarray:
     for path in (described, chunk):
         check_regular(path, _MOST_FILE_BYTES)
     dtype = np.dtype(_DTYPES[name])
-    # What `_write_array` writes is read here: to open an array and read its one chunk takes Zarr as long as all the rest.
+    # What `_write_array` writes is read here: Zarr takes as long to open an array as the rest of a frame takes.
     try:
         stored = read_json(described)
         if (form := (stored["data_type"], tuple(stored["shape"]))) != (dtype.name, tuple(shape)):

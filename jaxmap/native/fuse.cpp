@@ -55,8 +55,7 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
   });
   if (frame.carve) {
     const View view(frame);
-    float* along = work->along.of(frame.shape[1]);
-    for (int64_t y = 0; y < frame.shape[1]; ++y) along[y] = frame.centre(1, y);
+    measure_row(frame, work->along);
     in_parallel(pool, frame.shape[0], [&](int64_t plane) { freed += carve_plane(frame, view, plane, *work); });
   }
   for (int64_t share = 0; share < threads; ++share) {
@@ -105,7 +104,8 @@ ffi::Error fuse_frame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi:
   frame.log_odds = new_log_odds->typed_data();
   frame.surface = surface.element_count() ? new_surface->typed_data() : nullptr;
   // Where XLA could not give the results the place of the arguments.
-  if (frame.log_odds != log_odds.typed_data()) std::memcpy(frame.log_odds, log_odds.typed_data(), log_odds.size_bytes());
+  if (frame.log_odds != log_odds.typed_data())
+    std::memcpy(frame.log_odds, log_odds.typed_data(), log_odds.size_bytes());
   if (frame.surface != nullptr && frame.surface != surface.typed_data())
     std::memcpy(frame.surface, surface.typed_data(), surface.size_bytes());
   fuse(pool, frame, counted->typed_data());

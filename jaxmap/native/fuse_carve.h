@@ -12,6 +12,7 @@
 
 #include "fuse_frame.h"
 #include "fuse_points.h"
+#include "vectors.h"
 
 namespace jaxmap {
 
@@ -102,12 +103,19 @@ inline void look_up(const Frame& frame, float x, const float* y, float z, int co
 }
 
 // Marks the voxels that lie before what was seen where they are; returns how many do.
-inline int32_t mark_before(const float* distance, const float* reach, const int32_t* place, int count, int32_t* before) {
+inline int32_t mark_before(const float* distance, const float* reach, const int32_t* place, int count,
+                           int32_t* before) {
   float there[kTogether];
   for (int j = 0; j < count; ++j) there[j] = reach[place[j]];
   int32_t any = 0;
   for (int j = 0; j < count; ++j) any += before[j] = distance[j] < there[j] ? 1 : 0;
   return any;
+}
+
+// The y of the centres along a row; those beyond the window, up to where they are looked up together, are nowhere.
+inline void measure_row(const Frame& frame, Scratch<float>& along) {
+  float* y = along.of(frame.shape[1] + kTogether);
+  for (int64_t j = 0; j < frame.shape[1] + kTogether; ++j) y[j] = j < frame.shape[1] ? frame.centre(1, j) : NAN;
 }
 
 // Marks down the voxels of one plane of the window that the camera saw through; returns how many.
@@ -122,7 +130,8 @@ inline int32_t carve_plane(const Frame& frame, const View& view, int64_t plane, 
     float* cells = frame.log_odds + frame.cell(plane, 0, level);
     const int32_t* slots = work.voxel_slots.data() + plane * frame.shape[1] * depth + level;
     for (int64_t begin = row.begin; begin < row.end; begin += kTogether) {
-      const int count = int(std::min<int64_t>(kTogether, row.end - begin));
+      // Whole vectors, beyond the row as well: there, too, it is looked up what is free.
+      const int count = int(std::min<int64_t>(kTogether, (row.end - begin + kLanes - 1) / kLanes * kLanes));
       look_up(frame, x, work.along.get() + begin, z, count, found);
       if (mark_before(found.distance, work.block_reach.get(), found.block, count, before) == 0 ||
           mark_before(found.distance, work.reach.get(), found.pixel, count, before) == 0)

@@ -39,7 +39,7 @@ inline void gather_tiles(const Frame& frame, int64_t tiles, int64_t share, int64
   }
 }
 
-// What the rule makes of the weights of a voxel's points by class: the increment to occupancy, and shares of increments.
+// What the rule makes of a voxel's weights by class: how much it is hit, which is returned, and the share of each class.
 inline float share_out(const Frame& frame, const float* row, float points, float* shares) {
   const int classes = frame.classes, rows = classes + 1;
   if (frame.rule == kSum) {

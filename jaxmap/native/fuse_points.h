@@ -1,8 +1,8 @@
 // From pixels to sums over the points in each voxel, a tile of pixels at a time. Points never lie in memory.
 //
-// Neighbours in a row that fall into one voxel are a run. Each run is added, lane by lane of the vectors, to the sums of
-// its voxel in the tile; the lanes are added up when the tile is done. What a voxel gets thus hangs neither on the
-// window nor on the number of threads.
+// Neighbours in a row that fall into one voxel are a run. Each run is added, lane by lane, to the sums of its voxel in
+// the tile; the lanes are added up when the tile is done. What a voxel gets thus hangs neither on the window nor on the
+// number of threads.
 
 #pragma once
 
@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <memory>
 #include <utility>
 
 #include "fuse_frame.h"
@@ -39,7 +40,7 @@ struct Strip {
   uint8_t starts[kTileColumns + sizeof(uint64_t)];    // where a run starts
 };
 
-// Sums over points are kept in eight lanes, on all processors, and so have the same bits on all.
+// Sums over points are kept in eight lanes: points are added in one order on all processors.
 constexpr int kLaneCount = 8;
 typedef float Lanes __attribute__((vector_size(kLaneCount * sizeof(float))));
 typedef int32_t LaneMask __attribute__((vector_size(kLaneCount * sizeof(int32_t))));
@@ -168,7 +169,7 @@ inline void weigh_heights(const Frame& frame, const Strip& strip, int count, flo
   }
 }
 
-// Marks where runs start, and past the end, so that one is always found; where there are labels, points of a run share it.
+// Marks where runs start, and past the end, so that one is always found. Points of a run have one label, if any.
 inline void find_runs(const int32_t* __restrict voxels, const int32_t* __restrict labels, int count,
                       uint8_t* __restrict starts) {
   starts[0] = 1;
@@ -236,11 +237,22 @@ inline void add_runs(const Frame& frame, int64_t pixel, int count, const Strip& 
   }
 }
 
+// What a thread keeps from tile to tile.
+struct TileMemory {
+  Strip strip;
+  TileSums sums;
+  Scratch<float> values;
+
+  // To be asked for once a tile: a library looks up what is a thread's own by a call.
+  static TileMemory& own() {
+    thread_local const auto memory = std::make_unique<TileMemory>();
+    return *memory;
+  }
+};
+
 // Sums up the points of a tile by voxels; returns how many there are.
 inline PixelCounts sum_tile(const Frame& frame, int64_t tile, Workspace& work) {
-  thread_local TileSums sums;
-  thread_local Strip strip;
-  thread_local Scratch<float> kept;
+  auto& [strip, sums, kept] = TileMemory::own();
   float *values = kept.of((frame.value_rows() + 1) * kStride), farthest[kTileColumns] = {};
   PixelCounts counts;
   const int64_t tiles_across = (frame.width + kTileColumns - 1) / kTileColumns;

@@ -4,8 +4,9 @@
 
 Without observations, four frames of the bundled traverse (1024 x 768 pixels, three classes by the bundled network) are
 perceived first. The frames are fused over and over, with the default voxels and with voxels of 0.1 m, `--frames`
-of them in each round; pictures of key frames are left out, which a run has of 22 frames at most. Prints medians and the best round, with the load of the machine: other programs on its cores make
-all of it slower, the time that the processors work least so.
+of them in each round; pictures of key frames are left out, which a run has of 22 frames at most. Prints medians and the
+best round, with the load of the machine: other programs on its cores make all of it slower, the time that the
+processors work least so.
 """
 
 from __future__ import annotations

@@ -25,9 +25,11 @@ from jaxmap.labels import IGNORE
 from jaxmap.native.build import FUSE_TARGET, has_kernel
 from jaxmap.types import PointLabels, VoxelMap, make_grid, make_stereo_camera, make_voxel_map
 
-HEIGHT_PX, WIDTH_PX = 60, 80
-"""More pixels than the kernel works on together."""
-CAMERA = make_stereo_camera(fx_px=60, cx_px=39.2, cy_px=30.7, baseline_m=0.2, width_px=WIDTH_PX, height_px=HEIGHT_PX)
+HEIGHT_PX, WIDTH_PX = 28, 300
+"""Several of the kernel's tiles beside and above each other, the last ones cut off."""
+CAMERA = make_stereo_camera(
+    fx_px=160, cx_px=149.2, cy_px=13.7, baseline_m=0.075, width_px=WIDTH_PX, height_px=HEIGHT_PX
+)
 DEPTHS_M = (0.3, 5.0)
 GRID = make_grid([-4.1, -4.1, -2.9], [4.3, 4.2, 3.1], (0.15, 0.2, 0.3))
 RULES = [
