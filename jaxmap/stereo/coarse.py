@@ -32,6 +32,9 @@ class CoarseMatcher:
     Args:
         matcher: of the full images.
         width_px: of the full images.
+
+    Attributes:
+        limit_px: disparities of the full images from here on are not searched.
     """
 
     def __init__(self, matcher: Matcher | JaxMatcher, width_px: int) -> None:
@@ -47,6 +50,7 @@ class CoarseMatcher:
             edge_step_px=0,
         )
         self._matcher = Matcher(options, width_px)
+        self.limit_px = self._shrink * (least_px + self._matcher.num_disparities)
 
     def __call__(self, left: np.ndarray, right: np.ndarray) -> Coarse:
         """What a rectified pair shows.

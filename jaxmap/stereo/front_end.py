@@ -130,9 +130,9 @@ class StereoFrontEnd:
             return frame
         coarse, matcher = self.coarse(frame.left, frame.right), self.matcher
         image_px = frame.left.shape[:2]
-        if isinstance(matcher, Matcher) and matcher.narrows:
-            frame = frame._replace(bands=search_bands(coarse, matcher, image_px[0]))
         limit_px = matcher.options.min_disparity_px + matcher.num_disparities
+        if isinstance(matcher, Matcher) and matcher.narrows and self.coarse.limit_px >= limit_px:
+            frame = frame._replace(bands=search_bands(coarse, matcher, image_px[0]))
         near = too_near(coarse, limit_px, image_px) if matcher.options.near_guard else None
         if near is None:
             return frame

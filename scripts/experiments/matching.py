@@ -3,11 +3,11 @@
     python scripts/experiments/matching.py [--matchers 3way bands sgbm hh census bt --p1 0.15 --p2 0.8 --frames 3]
 
 `bands` is 3WAY as `jaxmap map` runs it (`stereo.narrow`). Disparities searched, block, uniqueness, left-right check and
-speckles are the defaults of `StereoOptions` for all; edges of depth are kept. With truth (the Motorcycle pair; frames of
-simulated traverses with `gt/depth`): `matched`, the share of the pixels whose disparity is known that have one; of
-these, `off_1` and `off_3`, which err by more than 1 and 3 px, and the median error; `bad_1` and `bad_3`, the same shares
-over all pixels, where a pixel without a match is a bad one. Without truth, of KITTI and K10 `agreeing`: points within
-5 % of the depth measured five frames later. `ms` is time of the processor.
+speckles are the defaults of `StereoOptions` for all; edges of depth are kept. With truth (the Motorcycle pair; frames
+of simulated traverses with `gt/depth`): `matched`, the share of the pixels whose disparity is known that have one; of
+these, `off_1` and `off_3`, which err by more than 1 and 3 px, and the median error; `bad_1` and `bad_3`, the same
+shares over all pixels, where a pixel without a match is a bad one. Without truth, of KITTI and K10 `agreeing`: points
+within 5 % of the depth measured five frames later. `ms` is time of the processor.
 """
 
 from __future__ import annotations

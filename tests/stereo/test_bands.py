@@ -104,3 +104,8 @@ def test_where_small_images_show_nothing_everything_is_searched():
 def test_only_the_mode_whose_paths_are_short_is_matched_in_bands(options):
     left, right, _ = slope_pair()
     assert StereoFrontEnd(CAMERA, StereoOptions(**options)).ready(left, right).bands == ()
+
+
+def test_what_small_images_cannot_reach_is_searched_everywhere():
+    left, right, _ = slope_pair()
+    assert StereoFrontEnd(CAMERA, StereoOptions(num_disparities=400)).ready(left, right).bands == ()
