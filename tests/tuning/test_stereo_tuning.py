@@ -27,6 +27,7 @@ from jaxmap.labels import ROVER_CLASSES
 from jaxmap.mapping.step import MapperParams, make_mapper
 from jaxmap.matching.design import MOST_P1, MOST_P2, MatchDesign, make_match_params
 from jaxmap.runs.config import load_config
+from jaxmap.runs.tuning import descent_notes
 from jaxmap.stereo.front_end import RectifiedFrame
 from jaxmap.tuning.evidence_cache import CacheRecipe
 from jaxmap.tuning.map_loss import MapTruth
@@ -196,6 +197,12 @@ def test_what_does_not_serve_is_refused(cli, scene_folder, tmp_path, words, told
     assert outcome.status == 2
     assert told in outcome.error
     assert not (tmp_path / "stereo.yaml").exists()
+
+
+def test_a_loss_that_falls_nowhere_is_told():
+    stage = {"name": "tuned", "best_step": 0, "tried": 7, "history": [{"step": 0, "loss": 1.0, "held_out": 1.0}]}
+    (note,) = descent_notes(stage)
+    assert "the loss falls nowhere around the start, whose numbers are kept (7 steps tried" in note
 
 
 @pytest.mark.slow
