@@ -169,11 +169,11 @@ class Run:
             front_end.matcher(left, right)
         with spent.stage("small images"):
             coarse = front_end.coarse(left, right)
-            if prepared.rectified.bands is not None:
+            if bands := prepared.rectified.bands:
                 search_bands(coarse, front_end.matcher, left.shape[0])
-        if prepared.rectified.bands is not None:
+        if bands:
             with spent.stage("match what they show"):
-                front_end.matcher(left, right, prepared.rectified.bands)
+                front_end.matcher(left, right, bands)
         with spent.stage("hand over"):
             to_device(as_rgb(left))
             to_device(as_rgb(right) if frame.disparity_px is None else frame.disparity_px)
