@@ -80,7 +80,7 @@ class MatchParams:
     cost: PyTree = field(default_factory=dict)
 
 
-_PENALTIES: dict[str, tuple[float, float]] = {"census": (0.15, 0.8), "bt": (0.13, 0.5), "mccnn": (0.1, 0.6)}
+_PENALTIES: dict[str, tuple[float, float]] = {"census": (0.15, 0.8), "bt": (0.13, 0.5), "mccnn": (0.4, 0.6)}
 
 
 def make_match_params(
