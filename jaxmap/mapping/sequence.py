@@ -76,7 +76,7 @@ def prepare_frames(
         label_folder: where each frame's labels lie, for the `files` labeller.
         needs: what the labeller asks of each frame (`Labeller.needs`); the rectified left image is delivered,
             as RGB, where it is `image`.
-        matched: with their disparity; else with both images, as RGB, for a step that matches them.
+        matched: with their disparity; else with both images, the right one grey, for a step that matches them.
         pose_errors: of the members of an ensemble, for each frame.
         indices: which frames; by default all.
         workers: threads.
@@ -118,7 +118,7 @@ def prepare_frames(
 def _to_match(rectified: RectifiedFrame) -> dict[str, Any]:
     """What a frame holds beside its left image for a step that matches it."""
     blind = np.zeros(rectified.left.shape[:2], bool) if rectified.blind is None else rectified.blind
-    return {"right_image": to_device(as_rgb(rectified.right)), "blind": to_device(blind)}
+    return {"right_image": to_device(rectified.right), "blind": to_device(blind)}
 
 
 def observed_frames(
@@ -233,7 +233,7 @@ def frame_form(
     def frame() -> Frame:
         filled: dict[str, Any] = {} if labeller.needs is None else {labeller.needs: jnp.zeros(*kinds[labeller.needs])}
         if not matched:
-            filled |= {name: jnp.zeros((*size, 3), np.uint8) for name in ("image", "right_image")}
+            filled["image"], filled["right_image"] = jnp.zeros((*size, 3), np.uint8), jnp.zeros(size, np.uint8)
             filled["blind"] = jnp.zeros(size, bool)
         pose_errors = jnp.zeros((members, 6), np.float32) if members else None
         disparity_px = jnp.zeros(size, np.float32) if matched else None

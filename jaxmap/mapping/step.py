@@ -429,8 +429,8 @@ def _check_matching(design: StepDesign, frame: Frame, params: MapperParams) -> N
             where="mapper",
             fix="fill Frame.image, Frame.right_image and MapperParams.match",
         )
-    if frame.image.shape != frame.right_image.shape:
-        left, right = (tuple(image.shape) for image in (frame.image, frame.right_image))
+    left, right = (image.shape[:2] for image in (frame.image, frame.right_image))
+    if left != right:
         raise JaxmapError(f"the left image is {left}, the right one {right}", where="mapper", fix="give equal ones")
 
 

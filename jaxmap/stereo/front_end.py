@@ -28,11 +28,10 @@ _BLANK_FIX = "take the frame out, or choose others with --start, --stop and --st
 class RectifiedFrame(NamedTuple):
     """A rectified pair, the disparity of its left image in px (NaN where unknown), and the time of the two stages.
 
-    The images are empty where observations are read again; the right one is grey where OpenCV matches it.
-    The disparity is None where the compiled step finds it. `blind` are pixels that have none, whatever the images
-    show: the raw image does not reach there, or something is too near; `bands` say what is searched where.
-    `too_near` is the share of pixels that were left out because they are nearer than all that is searched, and
-    `nearest_px` the disparity of the nearest of them.
+    The images are empty where observations are read again; the right one is grey. The disparity is None where the
+    compiled step finds it. `blind` are pixels that have none, whatever the images show: the raw image does not reach
+    there, or something is too near; `bands` say what is searched where. `too_near` is the share of pixels that were
+    left out because they are nearer than all that is searched, and `nearest_px` the disparity of the nearest of them.
     """
 
     left: np.ndarray
@@ -116,8 +115,8 @@ class StereoFrontEnd:
             for side, image in (("left", left), ("right", right)):
                 if (reason := blank_reason(image)) is not None:
                     raise FrameError(f"the {side} image {reason} and cannot be matched", fix=_BLANK_FIX)
-            # OpenCV's matcher takes grey images; nothing else looks at the right one, which is a third to rectify then.
-            left, right = self.rectify(left, as_grey(right) if isinstance(self.matcher, Matcher) else right)
+            # Matchers take grey images, and nothing else looks at the right one, which is a third to rectify then.
+            left, right = self.rectify(left, as_grey(right))
         blind = None if self.rectifier is None else ~self.rectifier.seen
         frame = RectifiedFrame(left, right, None, stages_s["rectify"], 0.0, blind=blind)
         with timed_stage("match", stages_s):

@@ -176,7 +176,7 @@ class Run:
                 front_end.matcher(left, right, bands)
         with spent.stage("hand over"):
             to_device(as_rgb(left))
-            to_device(as_rgb(right) if frame.disparity_px is None else frame.disparity_px)
+            to_device(right if frame.disparity_px is None else frame.disparity_px)
         with spent.stage("step"):
             self.voxel_map, info = self.mapper.step(self.voxel_map, frame, plan.params, plan.key)
             jax.block_until_ready(self.voxel_map.log_odds)
