@@ -13,13 +13,14 @@ import reference_matching as twin
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxmap.matching.design import MOST_P2, MatchDesign, make_match_params
+from jaxmap.matching.design import MOST_P2, MatchDesign, MatchParams, make_match_params
 from jaxmap.matching.kernel import decide_cpu, winners_cpu
 from jaxmap.matching.match import find_winners, match, penalties
 from jaxmap.matching.select import Winners, decide
 from jaxmap.native.build import SELECT_TARGET, SGM_TARGET, has_kernel
 
 HEIGHT, WIDTH, COUNT = 9, 40, 20
+SMALL = MatchDesign(census_window_px=(3, 3))
 
 pytestmark = pytest.mark.skipif(
     not all(map(has_kernel, (SGM_TARGET, SELECT_TARGET))), reason="no C++ compiler, or no CPU"
@@ -43,11 +44,11 @@ def drawn_winners(seed: int, shape: tuple[int, int]) -> Winners:
     return Winners(place, np.minimum(cost, 30).astype(np.uint16), *others)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 99),
-    height=st.integers(1, 6),
-    width=st.integers(1, 30),
+    height=st.integers(1, 4),
+    width=st.integers(1, 18),
     disparities=st.sampled_from([1, 2, 3, 15, 32, 40, 64, 70, 100, 130]),
     first=st.integers(-5, 5),
     block=st.sampled_from([1, 3, 5]),
@@ -56,18 +57,22 @@ def drawn_winners(seed: int, shape: tuple[int, int]) -> Winners:
     p2=st.floats(0, MOST_P2),
 )
 def test_winners_are_those_of_the_twin(seed, height, width, disparities, first, block, paths, p1, p2):
-    design = MatchDesign(
-        num_disparities=disparities,
-        min_disparity_px=first,
-        block_size=block,
-        paths=paths,
-        census_window_px=(3, 3),
-    )
-    params = make_match_params(p1=p1, p2=p2)
-    left, right = seen(seed, (height, width))
-    steps = [int(penalty) for penalty in penalties(design, params)]
-    costs = twin.mean_census_costs(left, right, range(first, first + disparities), (3, 3), block, design.cost_steps)
-    expected = twin.winners(twin.aggregate(costs, *steps, paths))
+    design = replace(SMALL, num_disparities=disparities, min_disparity_px=first, block_size=block, paths=paths)
+    check_winners(design, *seen(seed, (height, width)), make_match_params(p1=p1, p2=p2))
+
+
+@pytest.mark.parametrize("disparities", [290, 2032])
+def test_many_disparities_go_through_as_many_vectors(disparities):
+    design = replace(SMALL, num_disparities=disparities, min_disparity_px=-9)
+    check_winners(design, *seen(1, (2, 3)), make_match_params())
+
+
+def check_winners(design: MatchDesign, left: np.ndarray, right: np.ndarray, params: MatchParams) -> None:
+    """They are those of the twin."""
+    first, steps = design.min_disparity_px, [int(penalty) for penalty in penalties(design, params)]
+    disparities, window_px = range(first, first + design.num_disparities), design.census_window_px
+    costs = twin.mean_census_costs(left, right, disparities, window_px, design.block_size, design.cost_steps)
+    expected = twin.winners(twin.aggregate(costs, *steps, design.paths))
     found = winners_cpu(design, jnp.asarray(left), jnp.asarray(right), params, *penalties(design, params))
     for name, one, other in zip(Winners._fields, found, expected, strict=True):
         np.testing.assert_array_equal(one, other, err_msg=name)
