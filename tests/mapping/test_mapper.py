@@ -78,7 +78,8 @@ def an_example_frame(seed: int) -> Frame:
 
 
 def assert_maps_equal(one, other, atol: float = 0.0) -> None:
-    np.testing.assert_allclose(one.log_odds, other.log_odds, rtol=0, atol=atol)
+    # Where sums may round otherwise, large ones do so by more.
+    np.testing.assert_allclose(one.log_odds, other.log_odds, rtol=0.1 * atol, atol=atol)
     assert one.frames_fused == other.frames_fused
 
 
