@@ -37,7 +37,8 @@ from jaxmap.types import Frame, make_grid, make_stereo_camera
 
 SAND, ROCK = CLASSES.index("sand"), CLASSES.index("rock")
 CAMERA = make_stereo_camera(fx_px=90.0, fy_px=90.0, cx_px=63.5, cy_px=47.5, baseline_m=0.4, width_px=128, height_px=96)
-GRID = make_grid([0, -4, -2], [8, 4, 1], 0.25)
+# No face of voxels lies in a face of the scene.
+GRID = make_grid([0, -4, -2], [8, 4, 1], 0.26)
 RANGE_M = (0.3, 8.0)
 FUSION = make_fusion_params(CLASSES, disparity_sigma_px=0.05)
 KEY = jax.random.key(1)
