@@ -93,9 +93,9 @@ class StereoOptions:
     """Edge of the square, odd, that is near."""
     pad_left: bool = True
     """Match the leftmost columns too."""
-    narrow: bool = True
-    """Mode 3way: search in each part of the image the disparities that small images show there, and no others: faster,
-    with fewer false matches."""
+    narrow: bool = False
+    """Mode 3way: search in each part of the image the disparities that small images show there, and no others: a
+    quarter faster. More pixels are matched, doubtful ones among them, which blur low relief."""
     near_guard: bool = True
     """Leave out what is too near for the disparities searched, instead of taking false matches there."""
 

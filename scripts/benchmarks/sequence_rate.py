@@ -1,7 +1,7 @@
 """How near `jaxmap map` comes to the rate of its matcher alone, and what each stage of a frame costs the processors.
 
     python scripts/benchmarks/sequence_rate.py [SEQUENCE] [--frames 28] [--rounds 5] [--config F] [--labeller deeplab]
-        [--matcher sgm] [--json F]
+        [--matcher sgm] [--narrow] [--json F]
 
 By default the bundled traverse (14 pairs of 1024 x 768 pixels, raw), its images written anew as PNG. In each round
 OpenCV's SGBM in its 3WAY mode goes over the rectified pairs in grey, as many disparities and no more, and then the
@@ -46,6 +46,7 @@ def main() -> None:
     parser.add_argument("--config", help="YAML file, or the name of a bundled one")
     parser.add_argument("--labeller", choices=["none", "plane", "relief", "deeplab"])
     parser.add_argument("--matcher", choices=["opencv", "sgm", "mccnn"])
+    parser.add_argument("--narrow", action="store_true", help="match in bands")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
@@ -61,6 +62,8 @@ def main() -> None:
         config = replace(config, labeller=given.labeller)
     if given.matcher:
         config = replace(config, stereo=replace(config.stereo, matcher=given.matcher))
+    if given.narrow:
+        config = replace(config, stereo=replace(config.stereo, narrow=True))
     with tempfile.TemporaryDirectory() as folder:
         source = given.sequence or str(bundled_as_png(Path(folder, "traverse")))
         run = Run(plan_run(source, config, print, match_in_step=True), Path(folder))

@@ -2,7 +2,7 @@
 
     python scripts/experiments/matching.py [--matchers 3way bands sgbm hh census bt --p1 0.15 --p2 0.8 --frames 3]
 
-`bands` is 3WAY as `jaxmap map` runs it (`stereo.narrow`). Disparities searched, block, uniqueness, left-right check and
+`bands` is 3WAY as `--stereo.narrow` runs it. Disparities searched, block, uniqueness, left-right check and
 speckles are the defaults of `StereoOptions` for all; edges of depth are kept. With truth (the Motorcycle pair; frames
 of simulated traverses with `gt/depth`): `matched`, the share of the pixels whose disparity is known that have one; of
 these, `off_1` and `off_3`, which err by more than 1 and 3 px, and the median error; `bad_1` and `bad_3`, the same
@@ -41,7 +41,7 @@ def opencv(mode: str, width_px: int) -> Match:
 
 
 def in_bands(width_px: int) -> Match:
-    """OpenCV's 3WAY as `jaxmap map` runs it: in bands, of the disparities that small images show there."""
+    """OpenCV's 3WAY as `--stereo.narrow` runs it: in bands, of the disparities that small images show there."""
     matcher = Matcher(StereoOptions(edge_step_px=0), width_px)
     coarse = CoarseMatcher(matcher, width_px)
     return lambda left, right: matcher(left, right, search_bands(coarse(left, right), matcher, len(left)))

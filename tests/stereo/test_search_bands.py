@@ -100,7 +100,7 @@ def test_where_small_images_show_nothing_everything_is_searched():
     np.testing.assert_array_equal(matcher(left, right, [matcher.band(0, HEIGHT_PX)]), matcher(left, right))
 
 
-@pytest.mark.parametrize("options", [{"mode": "hh"}, {"narrow": False}, {"matcher": "sgm"}])
+@pytest.mark.parametrize("options", [{"mode": "hh", "narrow": True}, {}, {"matcher": "sgm"}])
 def test_only_the_mode_whose_paths_are_short_is_matched_in_bands(options):
     left, right, _ = slope_pair()
     assert StereoFrontEnd(CAMERA, StereoOptions(**options)).ready(left, right).bands == ()
@@ -108,4 +108,4 @@ def test_only_the_mode_whose_paths_are_short_is_matched_in_bands(options):
 
 def test_what_small_images_cannot_reach_is_searched_everywhere():
     left, right, _ = slope_pair()
-    assert StereoFrontEnd(CAMERA, StereoOptions(num_disparities=400)).ready(left, right).bands == ()
+    assert StereoFrontEnd(CAMERA, StereoOptions(num_disparities=400, narrow=True)).ready(left, right).bands == ()
