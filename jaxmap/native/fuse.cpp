@@ -31,7 +31,7 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
   const auto parts = [](int64_t whole, int64_t part) { return (whole + part - 1) / part; };
   const int64_t tiles = parts(frame.height, kTileRows) * parts(frame.width, kTileColumns);
   const int64_t threads = std::clamp<int64_t>(pool.num_threads(), 1, kMostThreads);
-  auto work = Workspace::take();
+  auto work = Kept<Workspace>::take();
   work->voxel_slots.resize(std::max<size_t>(work->voxel_slots.size(), frame.voxels()), 0);
   work->column_slots.resize(std::max<size_t>(work->column_slots.size(), frame.columns() * frame.window_layers()), 0);
   work->voxels.resize(std::max<size_t>(work->voxels.size(), threads));
@@ -64,7 +64,7 @@ void fuse(ffi::ThreadPool& pool, const Frame& frame, int32_t* counted) {
   }
   const int32_t numbers[] = {hits, freed, valid, in_range, kept};
   std::copy(std::begin(numbers), std::end(numbers), counted);  // `fusion.frame.Counted`
-  Workspace::give_back(std::move(work));
+  Kept<Workspace>::give_back(std::move(work));
 }
 
 ffi::Error fuse_frame(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> log_odds, ffi::Buffer<ffi::F32> surface,

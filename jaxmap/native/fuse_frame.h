@@ -3,8 +3,6 @@
 #pragma once
 
 #include <cstdint>
-#include <memory>
-#include <mutex>
 #include <vector>
 
 #include "vectors.h"
@@ -112,22 +110,6 @@ struct Workspace {
   // Of each voxel that a tile of pixels saw: its place, and the sums over those pixels.
   Scratch<int32_t> seen, seen_of_tile;
   Scratch<float> sums;
-
-  static std::unique_ptr<Workspace> take() {
-    std::lock_guard<std::mutex> lock(mutex);
-    if (idle.empty()) return std::make_unique<Workspace>();
-    auto taken = std::move(idle.back());
-    idle.pop_back();
-    return taken;
-  }
-
-  static void give_back(std::unique_ptr<Workspace> workspace) {
-    std::lock_guard<std::mutex> lock(mutex);
-    idle.push_back(std::move(workspace));
-  }
-
-  static inline std::mutex mutex;
-  static inline std::vector<std::unique_ptr<Workspace>> idle;
 };
 
 }  // namespace jaxmap

@@ -9,11 +9,8 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
-#include <memory>
-#include <mutex>
 #include <new>
 #include <utility>
-#include <vector>
 
 #include "census.h"
 #include "small_integers.h"
@@ -267,29 +264,6 @@ void match_any(ffi::ThreadPool& pool, const Pair& pair, Workspace& work, const W
   match_by<kWidest>(pool, pair, work, winners);
 }
 
-class Kept {
- public:
-  Kept() {
-    std::lock_guard<std::mutex> lock(mutex_);
-    if (idle_.empty()) {
-      work_ = std::make_unique<Workspace>();
-    } else {
-      work_ = std::move(idle_.back());
-      idle_.pop_back();
-    }
-  }
-  ~Kept() {
-    std::lock_guard<std::mutex> lock(mutex_);
-    idle_.push_back(std::move(work_));
-  }
-  Workspace& operator*() { return *work_; }
-
- private:
-  std::unique_ptr<Workspace> work_;
-  static inline std::mutex mutex_;
-  static inline std::vector<std::unique_ptr<Workspace>> idle_;
-};
-
 ffi::Error call(ffi::ThreadPool pool, ffi::Buffer<ffi::U32> left, ffi::Buffer<ffi::U32> right,
                 ffi::Buffer<ffi::U8> costs, ffi::Buffer<ffi::U8> penalties, ffi::Result<ffi::Buffer<ffi::S16>> place,
                 ffi::Result<ffi::Buffer<ffi::U16>> cost, ffi::Result<ffi::Buffer<ffi::U16>> second,
@@ -305,8 +279,9 @@ ffi::Error call(ffi::ThreadPool pool, ffi::Buffer<ffi::U32> left, ffi::Buffer<ff
   const Winners winners{place->typed_data(), cost->typed_data(), second->typed_data(), lower->typed_data(),
                         higher->typed_data()};
   try {
-    Kept work;
+    auto work = Kept<Workspace>::take();
     match_any(pool, pair, *work, winners);
+    Kept<Workspace>::give_back(std::move(work));
   } catch (const std::bad_alloc&) {
     return ffi::Error(ffi::ErrorCode::kResourceExhausted, "not enough memory to match an image");
   }

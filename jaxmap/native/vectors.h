@@ -6,7 +6,11 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
+#include <memory>
+#include <mutex>
 #include <new>
+#include <utility>
+#include <vector>
 
 #if defined(__linux__)
 #include <sys/mman.h>
@@ -76,6 +80,28 @@ class Scratch {
  private:
   Number* numbers_ = nullptr;
   int64_t size_ = 0;
+};
+
+// What calls keep for those after them: taken by one at a time, and given back by those that came to their end alone.
+template <typename Workspace>
+class Kept {
+ public:
+  static std::unique_ptr<Workspace> take() {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (idle_.empty()) return std::make_unique<Workspace>();
+    auto taken = std::move(idle_.back());
+    idle_.pop_back();
+    return taken;
+  }
+
+  static void give_back(std::unique_ptr<Workspace> workspace) {
+    std::lock_guard<std::mutex> lock(mutex_);
+    idle_.push_back(std::move(workspace));
+  }
+
+ private:
+  static inline std::mutex mutex_;
+  static inline std::vector<std::unique_ptr<Workspace>> idle_;
 };
 
 }  // namespace jaxmap

@@ -24,7 +24,7 @@ DEFAULT = ("sample:traverse", SHARED / "simdata" / "traverse_a", SHARED / "simda
 BEFORE = StereoOptions(block_size=5, p1=200, p2=800, speckle_window=100, edge_step_px=0.0)
 EDGES = StereoOptions(edge_step_px=0.0)
 MATCHERS = {"before": BEFORE, "edges kept": EDGES, "now": StereoOptions(), "sgm": StereoOptions(matcher="sgm")}
-"""`now` is the default, which drops edges of depth; `sgm` is jaxmap's own, in the step, and slow on a CPU."""
+"""`now` is the default, which drops edges of depth; `sgm` is jaxmap's own, in the step."""
 
 
 def sources(traverse: Traverse, model: Path | None) -> dict[str, MapConfig]:
@@ -59,6 +59,8 @@ def main() -> None:
         traverse = Traverse(path)
         for matcher in given.matchers:
             known = sources(traverse, given.model)
+            if unknown := set(given.labels or ()) - known.keys():
+                parser.error(f"--labels: {', '.join(sorted(unknown))} is none of {', '.join(known)}")
             for name in given.labels or known:
                 frames = Frames(traverse.sequence, traverse.truth)
                 result = frames.scored(replace(known[name], stereo=MATCHERS[matcher], stop=given.stop))
